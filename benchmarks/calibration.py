@@ -22,7 +22,7 @@ _QUICK = FitSettings(starts=1, members=24, nearby=16, poses=8, steps=1)
 
 
 def main() -> int:
-    """Measure what the first argument names."""
+    """Run the measurement that the first argument names."""
     chooser = argparse.ArgumentParser(description=__doc__)
     chooser.add_argument("measure", choices=("coverage", "plan", "transfer"), help="each has --help of its own")
     chosen = chooser.parse_args(sys.argv[1:2])

@@ -60,7 +60,7 @@ def progress_share(name: str) -> Iterator[Callable[[float], None]]:
 def measure_each(
     args: argparse.Namespace, names: Sequence[Any], measure: Callable[[Any], dict[str, Any]], *, key: str
 ) -> list[dict[str, Any]]:
-    """The row `measure` gives for each of `names`, which stands in the row under `key`.
+    """For each of `names` the row that `measure` returns; the value of the row under `key` is the name.
 
     Rows are stored after each measurement: the same command continues a run that was killed, until `finish`.
     """

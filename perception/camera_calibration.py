@@ -191,11 +191,11 @@ def fit_calibration(
 def scale_by_ruler(
     fit: CameraCalibration, points: Floats, length_mm: float, *, pixel: float = 1.0
 ) -> CameraCalibration:
-    """The calibration whose scale is such that two image points (2, 2) [px] are `length_mm` apart on the gel.
+    """`fit` with the scale at which two image points (2, 2) [px] are `length_mm` apart on the gel.
 
-    `scale_error` includes the error of reading the points, one pixel each, in an image whose pixels have the size
-    `pixel` [px]: below 1 where the image of `fit` is a reduced one. Raises UsageError for points outside the
-    image or too close to each other, and for an invalid length or spacing.
+    `scale_error` of the result includes the error of reading each point to one pixel of the image in which they were
+    read. `pixel` is the size of such a pixel in pixels of `fit`: below 1 if `fit` belongs to a reduced image. Raises
+    UsageError for points outside the image or too close to each other, and for an invalid length or spacing.
     """
     if not ((points >= -0.5) & (points <= np.array([fit.width, fit.height]) - 0.5)).all():
         raise UsageError(f"the points of the ruler must be in the image of {fit.width} × {fit.height} px")

@@ -242,9 +242,10 @@ def collect(
 
 
 def imitation_loss(error: torch.Tensor, bounded: float) -> torch.Tensor:
-    """Mean over errors (…, 3): a share `bounded` of 1 − exp(−r²/2), which seeks modes, the rest √(1 + r²) − 1.
+    """Mean of b (1 − exp(−r²/2)) + (1 − b) (√(1 + r²) − 1) over errors (…, 3) of length r, with b = `bounded`.
 
-    The second term has a gradient at any distance and dominates the start of a training.
+    The first term is bounded, so that its minimum is a mode and not a mean. The second one has a gradient at any
+    distance and dominates the start of a training.
     """
     squared = error.pow(2).sum(-1)
     return (bounded * (1 - torch.exp(-squared / 2)) + (1 - bounded) * (torch.sqrt(1 + squared) - 1)).mean()

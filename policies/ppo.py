@@ -102,8 +102,8 @@ class PPO(Learner):
         self._starts = torch.ones(n, dtype=torch.bool)
         self._actor_memory, self._critic_memory = self._actor.initial_memory(n), self._critic.initial_memory(n)
         self._return[:] = 0
-        self._in_first = np.ones(n, dtype=bool)  # environments whose first episode since then goes on
-        self._successes: list[bool] = []  # of the episodes that ended since then and are in no row yet
+        self._in_first = np.ones(n, dtype=bool)  # environments whose first episode since the restart has not ended
+        self._successes: list[bool] = []  # of the episodes that ended since the restart and are in no row yet
 
     def update(self) -> dict[str, float]:
         """Collects one rollout and learns from it."""
@@ -164,9 +164,9 @@ class PPO(Learner):
         return Rollout(*columns, advantages, *memories), numbers  # type: ignore[call-arg]
 
     def _success_rate(self) -> float:
-        """Success rate of the episodes that ended since the last rate; nan while a first episode goes on.
+        """Success rate of the episodes that ended since the last rate; nan until every environment has ended one.
 
-        After a restart all episodes start together, so the first ones to end are the short ones: their rate is biased.
+        After a restart all episodes start together, so the first ones to end are short: their success rate is biased.
         """
         if self._in_first.any() or not self._successes:
             return float("nan")

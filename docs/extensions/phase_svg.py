@@ -65,12 +65,12 @@ def changes(table: Mapping[Phase, PhaseRule]) -> list[tuple[Phase, Phase, bool]]
 
 
 def arrows(table: Mapping[Phase, PhaseRule]) -> list[Arrow]:
-    """The way of every allowed change. Raises ValueError for a change that the picture has no way for."""
+    """The arrow of every allowed change. Raises ValueError for a change whose path is not defined here."""
     placed = boxes()
-    return [Arrow(a, b, _way(placed, a, b), both) for a, b, both in changes(table)]
+    return [Arrow(a, b, _path(placed, a, b), both) for a, b, both in changes(table)]
 
 
-def _way(placed: Mapping[Phase, Box], start: Phase, end: Phase) -> tuple[Point, ...]:
+def _path(placed: Mapping[Phase, Box], start: Phase, end: Phase) -> tuple[Point, ...]:
     a, b = placed[start], placed[end]
     if start in _ROW and end in _ROW:
         right = 1 if b.x > a.x else -1

@@ -316,10 +316,10 @@ class _Loop:
             if self._asked is None:
                 self._clock.sleep(left)
             elif select.select((self._parent,), (), (), max(self._clock.wall(left), MIN_WAIT))[0]:
-                self._hear_parent()
+                self._handle_parent()
 
     def _listen(self) -> None:
-        self._hear_parent()
+        self._handle_parent()
         link, now = self._controller.links["in"], self._clock.now()
         with suppress(BlockingIOError):
             while True:
@@ -329,16 +329,16 @@ class _Loop:
         for message in link.take(now):
             self._controller.receive(message)
 
-    def _hear_parent(self) -> None:
+    def _handle_parent(self) -> None:
         for kind, *values in self._parent.read():
             if kind == "pose":
                 position, quaternion = values
                 self._controller.pose = (tuple(position), tuple(quaternion))
                 self._asked = None
             else:
-                self._obey(*values)
+                self._execute(*values)
 
-    def _obey(self, number: int, name: str, *values: Any) -> None:
+    def _execute(self, number: int, name: str, *values: Any) -> None:
         if name != "report":
             getattr(self._controller, name)(*values)
         self._parent.send(["done", number, asdict(self._controller.report)])

@@ -40,7 +40,7 @@ def _random_fault(rng: random.Random) -> Fault:
 
 
 def _random_begin(rng: random.Random) -> dict[str, float | int | str]:
-    choice = rng.choice(("at", "random", *EVENTS, "descent", "lowering"))  # the events under way twice as often
+    choice = rng.choice(("at", "random", *EVENTS, "descent", "lowering"))  # the last two twice as often
     if choice == "at":
         return {"at": round(rng.uniform(0.0, _LATEST), 2)}
     if choice == "random":

@@ -13,9 +13,9 @@ _FULL_EXCHANGES = 3  # without progress, before variables are exchanged one by o
 def solve_nonnegative(hessian: Array, linear: Array, start: NDArray[np.bool_]) -> Array:
     """The x ≥ 0 with the smallest ½ xᵀ hessian x − linearᵀ x, shape (n,).
 
-    Block principal pivoting after Portugal, Júdice and Vicente (1994): the set of positive variables is exchanged at
-    all wrong ones together, and at a single one where that stops to improve. `start` is the first set, for example
-    that of a similar problem. `hessian` must be positive definite.
+    Block principal pivoting after Portugal, Júdice and Vicente (1994): each iteration moves all infeasible variables
+    into or out of the set of positive ones, or a single one if their number no longer decreases. `start` is the first
+    set, for example that of a similar problem. `hessian` must be positive definite.
     """
     positive = start.copy()
     fewest, exchanges = len(linear) + 1, _FULL_EXCHANGES

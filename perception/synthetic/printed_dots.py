@@ -120,7 +120,7 @@ class DotPatches:
         return np.asarray(near.astype(np.intp) - self.reach)
 
     @cached_property
-    def _back(self) -> Array:
+    def _to_dot_frame(self) -> Array:
         """Maps image offsets to the frame of each dot, in which its radius is 1, shape (dots, 2, 2)."""
         return np.asarray(np.linalg.inv(self.shapes) / self.appearance.radius)
 
@@ -131,7 +131,7 @@ class DotPatches:
         off = self.corner - self.centers
         right = (off[:, :1] + steps).astype(np.float32)[:, None, :]
         down = (off[:, 1:] + steps).astype(np.float32)[:, :, None]
-        (a, b), (c, d) = self._back.astype(np.float32).transpose(1, 2, 0)[..., None, None]
+        (a, b), (c, d) = self._to_dot_frame.astype(np.float32).transpose(1, 2, 0)[..., None, None]
         return a * right + b * down, c * right + d * down
 
     @cached_property
@@ -139,7 +139,7 @@ class DotPatches:
         """Ink (1 inside, 0 outside): a smooth step of the first-order distance to the ellipse."""
         x, y = self.inner
         distance = np.maximum(np.hypot(x, y), np.float32(1e-6))
-        (a, b), (c, d) = self._back.astype(np.float32).transpose(1, 2, 0)[..., None, None]
+        (a, b), (c, d) = self._to_dot_frame.astype(np.float32).transpose(1, 2, 0)[..., None, None]
         # Gradient of `distance`: the normal of the outline times the length of a pixel in radii.
         right, down = (a * x + c * y) / distance, (b * x + d * y) / distance
         steep = np.maximum(np.hypot(right, down), np.float32(1e-6))

@@ -19,7 +19,7 @@ MOTIONS: tuple[Motion, ...] = get_args(Motion)
 
 INITIAL_REST = 3  # images at rest at the start of each sequence
 _CONTACT = 0.4  # radius of the contact / shorter side of the grid
-_WANDER = 0.6  # amplitude of the motion of the contact centre / marker spacing
+_CENTER_AMPLITUDE = 0.6  # amplitude of the motion of the contact centre / marker spacing
 _SLIP_RIM = 3.0  # width of the transition zone around a slipping patch / marker spacing
 
 Points = NDArray[np.float64]
@@ -83,7 +83,7 @@ class GelSequence:
     def _center(self, number: float) -> Points:
         """Centre of the contact (right, down) relative to the grid centre, in spacings."""
         turn = 2 * np.pi * number / 97 + self.appearance.seed if self.motion == "smooth" else self.appearance.seed
-        return np.array([_WANDER * np.cos(turn), _WANDER * np.sin(2 * turn)])
+        return np.array([_CENTER_AMPLITUDE * np.cos(turn), _CENTER_AMPLITUDE * np.sin(2 * turn)])
 
     def _radius(self) -> float:
         """Radius of the contact in spacings."""

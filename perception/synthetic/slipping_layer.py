@@ -126,8 +126,8 @@ class SlippingLayer:
         target = (self._moved + advance.T.ravel()).copy()
         shear, pressure = self._shear, self._pressure
         for _ in range(_ALTERNATIONS):
-            pressure = self._press(motion, shear, pressure)
-            changed = self._rub(target, pressure, shear)
+            pressure = self._solve_pressure(motion, shear, pressure)
+            changed = self._solve_shear(target, pressure, shear)
             change = float(np.abs(changed - shear).max(initial=0.0))
             shear = changed
             if change <= _CHANGE * max(float(np.abs(shear).max(initial=0.0)), 1e-9):
@@ -137,13 +137,13 @@ class SlippingLayer:
         return self._state()
 
     def _object_at(self, motion: ObjectMotion) -> Array:
-        """Position of the object's points that are at the cells [mm], shape (n, 2), relative to a fixed one."""
+        """Position of the object's points that are at the cells [mm], shape (n, 2), up to a constant of each point."""
         arm = self._position - self._motion.position_mm
         turned = motion.rotation * np.stack([-arm[:, 1], arm[:, 0]], axis=1)
         return np.asarray(turned + motion.position_mm)
 
-    def _press(self, motion: ObjectMotion, shear: Array, start: Array) -> Array:
-        """Pressure of each cell [N] for given shear: no gap where it presses, none pulls."""
+    def _solve_pressure(self, motion: ObjectMotion, shear: Array, start: Array) -> Array:
+        """Pressure of each cell [N] for given shear: ≥ 0, and without a gap where it is above 0."""
         n = len(self._position)
         if motion.normal <= 0:
             return np.zeros(n)
@@ -170,7 +170,7 @@ class SlippingLayer:
             active = active | inside
         return np.maximum(pressure, 0.0)
 
-    def _rub(self, target: Array, pressure: Array, start: Array) -> Array:
+    def _solve_shear(self, target: Array, pressure: Array, start: Array) -> Array:
         """Shear of each cell [N] for given pressure, by an accelerated projected gradient with restarts."""
         limit = self.friction * pressure
         free = np.flatnonzero(limit > 0)

@@ -19,11 +19,11 @@ Array = NDArray[np.float64]
 
 FORMAT = 2  # of report.json
 KNOWN, PARTLY = 0.3, 0.7  # largest width of an interval relative to that of the prior
-REPRODUCED = 1.25  # largest residual of a fit relative to noise and model error; beyond it, intervals mean nothing
-ALLOWED_ERROR = 1.5  # times the noise: larger errors of held-out flow maps are not explained by the model
+REPRODUCED = 1.25  # largest residual of a fit relative to noise and model error; beyond it, intervals are not valid
+ALLOWED_ERROR = 1.5  # largest error of held-out flow maps relative to the noise, up to which the model explains them
 PREDICTED = 1.5  # largest residual of the held-out attempts relative to noise and model error
 _HEIGHT_OFFSET = 1.5  # largest mean of the fitted start heights relative to their expected standard deviation
-_CORRELATED = 0.8  # absolute correlation of two parameters that only their combination determines
+_CORRELATED = 0.8  # absolute correlation above which only the combination of two parameters is determined
 
 
 @dataclass(frozen=True)
@@ -102,8 +102,8 @@ class Calibration:
     def predicted(self) -> bool | None:
         """Whether the residual of the held-out attempts is at most `PREDICTED`; None: none held out.
 
-        A fit that ends in a wrong minimum may reproduce the recordings as well, because the poses of their insertions
-        make up for wrong forces. The pose of another insertion does not.
+        A fit that ends in a wrong minimum may reproduce the recordings as well, because the fitted poses of their
+        insertions compensate wrong forces. The pose of an insertion that was not fitted does not.
         """
         return _predicted(self.held_out_residual)
 
@@ -189,7 +189,7 @@ def _predicted(residual: float | None) -> bool | None:
 
 
 def _estimates(fitted: tuple[Parameter, ...], result: FitResult, *, predicted: bool) -> tuple[Estimate, ...]:
-    """Estimates of the parameters, and of the ratio of the gains, which may be known where no gain is.
+    """Estimates of the parameters, and of the ratio of the gains, which may be known although neither gain is.
 
     None is confirmed unless the fit converged and reproduces the recordings. The parameters of the simulator are
     confirmed only if the held-out insertion is predicted too: gains, rotations and crosstalk are differences between
@@ -225,7 +225,10 @@ def _pairs(fitted: tuple[Parameter, ...], result: FitResult) -> tuple[tuple[str,
 
 
 def _flow_maps(problem: Problem, after: tuple[Array, Array], rng: np.random.Generator) -> FlowMaps:
-    """Flow maps with the scene's values, whose poses and start heights are searched, and with a point and its poses."""
+    """Recorded flow maps, and simulated ones with the scene's values and with those of `after`: a point and its poses.
+
+    With the scene's values, the poses and start heights are searched.
+    """
     before = find_poses(problem, problem.scene_point(), rng)
     recorded = problem.recorded_flow()
     return FlowMaps(

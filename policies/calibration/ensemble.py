@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import SimulationError
-from gelflow.policies.calibration.poses import FREE, draw_poses, prior_cost_of_all
+from gelflow.policies.calibration.poses import INSERTED_POSE_SPREAD, draw_poses, prior_cost_of_all
 from gelflow.policies.calibration.problem import Problem
 from gelflow.policies.calibration.recordings import Recordings
 
@@ -77,9 +77,9 @@ def search_nearby(
     points = point + spread * rng.normal(size=(members, problem.size))
     if fixed:
         points[:, : len(problem.fitted)] = point[: len(problem.fitted)]
-    places = poses + spread * FREE * rng.normal(size=(members, *poses.shape))
-    points[0], places[0] = point, poses
-    return _invert(problem, points, places, _LATER_ROUNDS, rng)
+    members_poses = poses + spread * INSERTED_POSE_SPREAD * rng.normal(size=(members, *poses.shape))
+    points[0], members_poses[0] = point, poses
+    return _invert(problem, points, members_poses, _LATER_ROUNDS, rng)
 
 
 def _invert(
@@ -87,7 +87,7 @@ def _invert(
 ) -> tuple[Array, Array]:
     """Unknowns and poses of the best member of all rounds."""
     members, insertions = poses.shape[:2]
-    scale = np.tile(FREE, insertions)
+    scale = np.tile(INSERTED_POSE_SPREAD, insertions)
     lowest, best = np.inf, (points[0], poses[0])
     left = 1.0  # share of the recordings that is not yet taken into account
     for _ in range(rounds):
@@ -125,9 +125,9 @@ def _costs(problem: Problem, residuals: Array, points: Array, poses: Array) -> A
 
 
 def _share(residuals: Array, independent: float) -> float:
-    """The part of the recordings for which the update stays in the range of the present residuals.
+    """Share of the recordings that the next update takes into account: the larger, the smaller the residuals are.
 
-    `independent` is the number of those that are independent.
+    `independent` is the number of independent residuals.
     """
     half_squares = 0.5 * (residuals**2).sum(1)
     by_mean = independent / (2 * half_squares.mean())
@@ -136,7 +136,7 @@ def _share(residuals: Array, independent: float) -> float:
 
 
 def _updated(unknowns: Array, residuals: Array, share: float, rng: np.random.Generator) -> Array:
-    """Members after a `share` of the recordings, with perturbed observations."""
+    """Members after an update by a `share` of the recordings, with perturbed observations."""
     members = len(unknowns)
     spread = (residuals - residuals.mean(0)) / np.sqrt(members - 1)
     change = (unknowns - unknowns.mean(0)) / np.sqrt(members - 1)

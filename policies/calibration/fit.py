@@ -1,10 +1,10 @@
 """The fit: a global search, then searches of the poses and Levenberg-Marquardt steps in the parameters in turn.
 
-In between, the pose of each insertion is searched globally with the parameters found so far: local searches do not
-leave a wrong pose, for which wrong parameters make up.
+In between, the pose of each insertion is searched globally with the parameters found so far, because a local search
+does not leave a wrong pose that wrong parameters compensate.
 
-It is repeated from several independent starts. The forces have kinks and steps where contact points cross edges of the
-hole, so that starts can end in different minima; their spread is part of the intervals.
+The fit is repeated from several independent starts. The forces have kinks and steps where contact points cross edges
+of the hole, so that starts can end in different minima; their spread is part of the intervals.
 """
 
 from collections.abc import Callable, Sequence
@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 # ensemble: the error of the model that it allows for, and its spread around the best member, relative to the prior.
 _BEFORE = ((0.04, 0.2), (MODEL_ERROR, 0.1)), 1
 _AFTER = ((MODEL_ERROR, 0.05), (MODEL_ERROR, 0.02)), 3
-_SIZES = (0.1, 0.05, 0.025, 0.012)  # spread of new poses around the best ones, relative to their prior
+_SIZES = (0.1, 0.05, 0.025, 0.012)  # spread of new poses around the best ones, see `refined_poses`
 _SUFFICIENT = 1.0  # decrease of the cost in a round below which no other follows
 _AS_GOOD = 1.3  # starts whose residuals are larger than the best ones by this factor do not count
 
@@ -72,7 +72,7 @@ class FitResult:
 
     @property
     def converged(self) -> bool:
-        """Whether more than half of the starts fit about equally well: otherwise another could fit still better."""
+        """Whether more than half of the starts fit about equally well; if not, a further start might fit better."""
         return len(self.starts) > self.others
 
     @property
@@ -85,7 +85,7 @@ class FitResult:
         """Mean and covariance of a joint normal distribution of the whitened parameters.
 
         The covariance of one start is too small in some combinations of the parameters, along which the ends of the
-        starts differ. Theirs is added. No direction is wider than its prior.
+        starts differ. The covariance of these ends is added. No direction is wider than its prior.
         """
         points = np.stack([start.point[: self.count] for start in self.starts])
         between = points - points.mean(0)
@@ -99,7 +99,7 @@ class FitResult:
     def interval(self, directions: Array) -> tuple[Array, Array]:
         """95 % intervals of linear combinations (k, count) of the whitened parameters.
 
-        They reach from the lowest to the highest limit of all starts.
+        An interval reaches from the lowest limit of all starts to the highest one.
         """
         points = [directions @ start.point[: self.count] for start in self.starts]
         spread = [1.96 * np.sqrt(np.einsum("ki,ij,kj->k", directions, c, directions)) for c in self._covariances]
@@ -114,9 +114,9 @@ class FitResult:
 
     @property
     def _typical_excess(self) -> float:
-        """Median cost of the other starts above the best one: so far above the lowest minimum a search may end.
+        """Median of the cost of the other starts above that of the best one: a typical error of the search.
 
-        One standard deviation of each unknown costs half the number of unknowns.
+        For comparison: a displacement of every unknown by one standard deviation costs half the number of unknowns.
         """
         return float(np.median([start.cost - self.best.cost for start in self.starts[1:]] or [0.0]))
 

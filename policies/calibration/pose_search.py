@@ -28,7 +28,7 @@ def find_poses(
     count: int = 32,
     threads: int | None = None,
 ) -> tuple[Array, Array]:
-    """Poses (insertions, 3) and start heights for given whitened parameters; returns the unknowns, then the poses.
+    """Search poses (insertions, 3) and start heights for given whitened parameters; returns the unknowns and the poses.
 
     Where an insertion cannot be simulated with these parameters, its pose is drawn from the prior. `progress` gets the
     number of finished insertions. `members` are those of the first ensemble of a search, `count` the random poses at
@@ -49,9 +49,9 @@ def find_poses(
 def better_poses(
     problem: Problem, point: Array, poses: Array, rng: np.random.Generator, *, members: int, count: int
 ) -> tuple[Array, Array]:
-    """The point and poses (insertions, 3), with what `find_poses` finds for insertions that it fits better.
+    """Repeat `find_poses`, and replace pose and start heights of the insertions whose cost becomes lower.
 
-    One thread is used, as in a fit.
+    Returns the point and the poses (insertions, 3). One thread is used, as in a fit.
     """
     n = len(problem.fitted)
     other, found = find_poses(problem, point[:n], rng, members=members, count=count, threads=1)

@@ -11,14 +11,18 @@ from gelflow.policies.calibration.problem import Problem, in_hole
 Array = NDArray[np.float64]
 
 # Standard deviation of the pose of an inserted part in its hole [m, m, rad].
-FREE = np.array([1.3e-3, 1.3e-3, np.radians(2.5)])
+INSERTED_POSE_SPREAD = np.array([1.3e-3, 1.3e-3, np.radians(2.5)])
 _HEIGHTS = np.array([-1.5, -0.75, 0.0, 0.75, 1.5])  # start heights that are tried, in standard deviations
 _SHORTLIST = 6
 _PARENTS = 3  # best poses, around which new ones are drawn
 
 
 def draw_poses(problem: Problem, insertion: int, count: int, rng: np.random.Generator) -> Array:
-    """Misalignments (count, 3) of an insertion from their prior: the task's, and that the part was inserted."""
+    """Misalignments (count, 3) of an insertion, drawn from their prior.
+
+    The prior is that of the task. Of an inserted part, the pose at which it was inserted is normally distributed about
+    the pose of the hole; misalignments beyond 1.2 times the limits of the task are drawn again where possible.
+    """
     task = problem.recordings.task
     limit = np.maximum(np.asarray(task.misalignment), 1e-9)
     found = problem.recordings.inserted.get(insertion)
@@ -26,8 +30,8 @@ def draw_poses(problem: Problem, insertion: int, count: int, rng: np.random.Gene
         return task.draw_misalignment(rng, count)
     result = np.zeros((0, 3))
     while len(result) < count:
-        # in_hole(misalignment, found) is a pose in the hole.
-        pose = rng.normal(size=(8 * count, 3)) * FREE
+        # Solve in_hole(misalignment, found) = pose for the misalignment.
+        pose = rng.normal(size=(8 * count, 3)) * INSERTED_POSE_SPREAD
         yaw = pose[:, 2] - found[2]
         drawn = np.column_stack([apply_planar(np.column_stack([pose[:, :2], yaw]), -found[:2]), yaw])
         inside = drawn[(np.abs(drawn) <= 1.2 * limit).all(1)]
@@ -40,7 +44,7 @@ def prior_cost(problem: Problem, insertion: int, poses: Array) -> Array:
     found = problem.recordings.inserted.get(insertion)
     if found is None:
         return np.zeros(len(poses))
-    return np.asarray(0.5 * ((in_hole(poses, found[None]) / FREE) ** 2).sum(1))
+    return np.asarray(0.5 * ((in_hole(poses, found[None]) / INSERTED_POSE_SPREAD) ** 2).sum(1))
 
 
 def prior_cost_of_all(problem: Problem, poses: Array) -> Array:
@@ -66,7 +70,7 @@ def prior_information(problem: Problem, insertion: int) -> Array:
     if found is None:
         spread = np.maximum(np.asarray(problem.recordings.task.misalignment), 1e-9) / np.sqrt(3)
     else:
-        spread = FREE
+        spread = INSERTED_POSE_SPREAD
     return np.diag(1 / spread**2)
 
 
@@ -75,8 +79,9 @@ def best_poses(
 ) -> tuple[list[Array], list[Array], Array]:
     """The best candidates of each insertion: poses (k, 3), their costs (k,), and the point with their start heights.
 
-    Candidates are first compared up to the size of the flow maps, which depends on the start height, then with the best
-    of several start heights: `range_of_heights` is 1 for their whole range, less for a range around those of `point`.
+    First the candidates are ranked by the shape of their flow maps, because the size depends on the start height. The
+    best ones are then simulated with several start heights: over the whole range if `range_of_heights` is 1, otherwise
+    over this fraction of it around the heights of `point`.
     """
     short = [_by_shape(problem, point, i, poses, _SHORTLIST) for i, poses in enumerate(candidates)]
     poses, costs, heights = _with_heights(problem, point, short, range_of_heights)
@@ -98,7 +103,7 @@ def _simulate(
 
 
 def _by_shape(problem: Problem, point: Array, insertion: int, poses: Array, keep: int) -> Array:
-    """The poses whose flow maps have the shape of the recorded ones."""
+    """The `keep` poses whose flow maps, scaled to the size of the recorded ones, fit them best."""
     attempts, m = _rows(problem, insertion), len(poses)
     if not len(attempts):
         return poses[:keep]
@@ -149,10 +154,10 @@ def _with_heights(
 def refined_poses(
     problem: Problem, point: Array, poses: Array, rng: np.random.Generator, *, sizes: Sequence[float], count: int
 ) -> tuple[float, Array, Array]:
-    """Search the poses (insertions, 3) and start heights ever closer around the best ones, with fixed parameters.
+    """Random search of the poses (insertions, 3) and start heights with fixed parameters.
 
-    Each of `sizes`, relative to the prior, has `count` random poses of each insertion. Returns the cost, the point with
-    the start heights, and the poses.
+    Each round draws `count` poses of each insertion around the best ones so far; `sizes` are the spreads of the rounds,
+    relative to `INSERTED_POSE_SPREAD`. Returns the cost, the point with the start heights, and the poses.
     """
     parameters, best = point[: len(problem.fitted)], [pose[None] for pose in poses]
     costs: list[Array] = []
@@ -160,7 +165,8 @@ def refined_poses(
         candidates = []
         for present in best:
             parents = present[rng.integers(0, min(_PARENTS, len(present)), count)]
-            candidates.append(np.vstack([present, parents + size * rng.normal(size=parents.shape) * FREE]))
+            drawn = parents + size * rng.normal(size=parents.shape) * INSERTED_POSE_SPREAD
+            candidates.append(np.vstack([present, drawn]))
         best, costs, point = best_poses(problem, point, candidates, range_of_heights=size)
     fixed = 0.5 * float(parameters @ parameters) + problem.errors.log_determinant
     return float(sum(c[0] for c in costs)) + fixed, point, np.stack([p[0] for p in best])

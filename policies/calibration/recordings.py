@@ -74,8 +74,8 @@ class Recordings:
         """Standard deviation of the difference of two readings of a marker, in `unit`.
 
         From the second differences of the flow maps across rows and columns, in which smooth fields cancel. The median
-        over the markers of a pad ignores the edges of contacts; the lower quartile over attempts and pads, the maps of
-        firm contacts, which are not smooth.
+        over the markers of a pad ignores the edges of contacts; the lower quartile over attempts and pads ignores the
+        maps of firm contacts, which are not smooth.
         """
         of_pads = np.median(np.abs(_second_differences(self.flow)).reshape(math.prod(self.flow.shape[:2]), -1), axis=1)
         return float(np.quantile(of_pads, 0.25) / _MEDIAN_SIZE / self._roughness())
@@ -83,8 +83,8 @@ class Recordings:
     def _roughness(self) -> float:
         """Standard deviation of the second differences of markers whose noise has standard deviation 1.
 
-        Markers that are interpolated between printed ones share part of their noise. Their second differences have
-        different spreads: the value is that of a normal distribution with the same median size.
+        Markers that are interpolated between printed ones share part of their noise, so their second differences have
+        different spreads: the value is that of a normal distribution with the same median magnitude.
         """
         grid = self.task.grid
         if self.printed is None or self.printed == grid:
@@ -98,8 +98,9 @@ class Recordings:
     def stop_shear(self) -> tuple[float, float] | None:
         """Range of the shear along a finger at which descents stopped, in `unit`; None: all were motions of a plan.
 
-        The mean over the markers of the pad with more shear, from the lower quartile of the attempts to the largest:
-        a descent that ends without a stop shows less, one that stops late shows more.
+        The shear of an attempt is the mean over the markers of the pad that has more of it. The range is from the lower
+        quartile of the attempts to the largest: a descent that ends without a stop has less shear, one that stops late
+        has more.
         """
         if self.planned.all():
             return None

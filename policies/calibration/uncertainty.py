@@ -72,7 +72,7 @@ def _costs(problem: Problem, points: Array, poses: Array, scale: float) -> Array
 
 
 def _factors(problem: Problem, point: Array, poses: Array, axes: Array, scale: float) -> Array:
-    """Factor of each column of `axes` (unknowns and poses, one standard deviation each) by which it is too short."""
+    """Factor by which each column of `axes` has to be enlarged; a column is one standard deviation along an axis."""
     size, count = problem.size, axes.shape[1]
     base = _costs(problem, point[None], poses[None], scale)[0]
     factors = np.full((2, count), _FACTORS[-1])

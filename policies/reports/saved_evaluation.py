@@ -81,7 +81,7 @@ def _text(values: Mapping[str, Any]) -> str:
 
 
 def _film(path: Path) -> tuple[list[Image], float]:
-    """Pictures of a GIF, and how many of them are shown in a second."""
+    """The frames of a GIF, and their rate [1/s]."""
     with Pictures.open(path) as film:
         duration = film.info.get("duration", 1000)
         frames = [np.asarray(frame.convert("RGB")) for frame in ImageSequence.Iterator(film)]

@@ -1,8 +1,8 @@
 """Last step before the command of a run: makes the operating system end the command together with its worker.
 
-A worker that is killed cannot end its command, which would go on in a folder where the next start continues it.
-Arguments: process id of the worker, then the command. Uses the standard library only; Linux has this function, other
-systems rely on the lock of the run.
+A worker that is killed cannot end its command, which would then write into the same folder as the next start of the
+run. Arguments: process id of the worker, then the command. Uses the standard library only; Linux has this function,
+other systems rely on the lock of the run.
 """
 
 import ctypes

@@ -189,7 +189,7 @@ class TrainingRun:
         return result
 
     def _order(self, result: EvaluationResult) -> tuple[float, float]:
-        """Evaluations in the order of this value are better and better."""
+        """Sort key of an evaluation; larger is better."""
         return (result.success if self.settings.best_by == "success" else 0.0, result.reward)
 
     def _configuration(self) -> dict[str, Any]:

@@ -9,9 +9,9 @@ from numpy.typing import ArrayLike, NDArray
 from gelflow.errors import UsageError
 
 _RISE = 0.1  # of the final change: a signal above this has changed, one below half of it is at rest
-_NOISE = 5.0  # standard deviations of the noise that a change exceeds as well
-_BURST = 1e-3  # between samples that were received together [s]
-_VISIBLE = 0.5  # of the final change: the largest level that a noisy signal may need
+_NOISE = 5.0  # a change also exceeds this many standard deviations of the noise
+_BURST = 1e-3  # samples at most this far apart were received in a burst [s]
+_VISIBLE = 0.5  # of the final change: largest threshold; a change whose noise needs a higher one is not visible
 
 
 @dataclass(frozen=True)

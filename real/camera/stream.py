@@ -30,14 +30,15 @@ class ReceivedImage:
 class StreamCamera(ABC):
     """A `gelflow.protocols.Camera` whose images a thread receives; only the newest image is kept.
 
-    An image that repeats a recent one, that carries no later time of the camera's own clock than its predecessor, or
-    that is older than `timeout` at its reception is passed to `on_image` but is not new: `latest` and `next` do not
-    return it, and raise PeerTimeout when only such images arrive for `frozen_after` [s, robot time; by default
-    `timeout`]. `repeated`, `unclocked` and `late` count them.
+    Three kinds of images are not new, and each has a counter: an image that repeats a recent one (`repeated`), one
+    whose time on the camera's own clock is not later than that of its predecessor (`unclocked`), and one that is older
+    than `timeout` at its reception (`late`). They are passed to `on_image`, but `latest` and `next` do not return them.
+    Both raise PeerTimeout when only such images arrive for `frozen_after` [s, robot time; by default `timeout`].
 
-    The stamp of an image is the robot time of its reception, less `latency` and less its delay in addition to the
-    shortest one by the camera's own clock (if the camera sends its time). `latency` [s] is the constant time from the
-    exposure to the reception, which no clock shows; `gelflow.real.camera.estimate_latency` measures it.
+    The stamp of an image is the robot time of its reception, less `latency`. If the camera sends the time of its own
+    clock, the delay of the image in addition to the shortest delay seen is subtracted too. `latency` [s] is the
+    constant time from the exposure to the reception, which no clock shows; `gelflow.real.camera.estimate_latency`
+    measures it.
 
     `on_image` is called with every image in the reader thread, before the image is available to callers: a recording
     therefore holds each image before any decision based on it. An exception of `on_image` ends the stream and is

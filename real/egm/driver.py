@@ -68,7 +68,7 @@ class EgmArm:
         try:
             self._start()
             failure = f"the EGM process did not start in {_START_TIMEOUT} s"
-            self._wait(lambda: self._heard("listening"), _START_TIMEOUT, failure)
+            self._wait(lambda: self._received_event("listening"), _START_TIMEOUT, failure)
             self._wait(
                 lambda: self._opened().latest() is not None,
                 self._clock.wall(limit),
@@ -102,7 +102,7 @@ class EgmArm:
         """
         with self._lock:
             record = self._latest()
-            self._pump()  # the event that explains the record was sent before it
+            self._process_events()  # the event that explains the record was sent before it
             age = self._clock.now() - record.stamp
             if age > self._config.silence and not self._latched:
                 limit = self._config.silence
@@ -223,7 +223,7 @@ class EgmArm:
     def drain_events(self) -> list[EgmEvent]:
         """Changes of state since the last call, oldest first."""
         with self._lock:
-            self._pump(tolerant=True)
+            self._process_events(tolerant=True)
             events, self._events = self._events, []
             return events
 
@@ -300,7 +300,7 @@ class EgmArm:
         record = self._opened().latest()
         return record is not None and EgmFlag.FOLLOWING in record.flags and not self._latched
 
-    def _heard(self, kind: str) -> bool:
+    def _received_event(self, kind: str) -> bool:
         return any(event.kind == kind for event in self._events)
 
     def _refuse_when_latched(self) -> None:
@@ -314,7 +314,7 @@ class EgmArm:
             raise UsageError("the EGM arm is not connected; call connect() first")
         return self._helper
 
-    def _pump(self, *, tolerant: bool = False) -> None:
+    def _process_events(self, *, tolerant: bool = False) -> None:
         """Process the events of the EGM process. Raises PeerError when it has ended, unless `tolerant`."""
         helper = self._linked()
         for event in (EgmEvent(*values) for values in helper.messages.read()):
@@ -344,7 +344,7 @@ class EgmArm:
         end = deadline.now() + wall
         while True:
             with self._lock:
-                self._pump()
+                self._process_events()
                 if done():
                     return
             if deadline.now() > end:

@@ -268,9 +268,9 @@ class DescentSettings:
     # Thresholds of the mean change of shear along the finger since the reference, the larger of both pads [mm].
     contact_shear_mm: float = 0.04  # contact: the part is not in the hole
     stop_shear_mm: float = 0.12  # the descent stops at once
-    planned_stop_shear_mm: float = 0.25  # up to this, a motion plan may set a larger stop_shear_mm
+    planned_stop_shear_mm: float = 0.25  # largest stop_shear_mm of a motion plan, if above stop_shear_mm
     weight_check: bool = True  # both pads must show the part's weight at every grasp, which scales the thresholds
-    max_overshoot: float = 0.1e-3  # motion towards contact until the arm is at rest [m]: limits the speed of lowering
+    max_overshoot: float = 0.1e-3  # largest travel of the arm after contact [m]; limits the speed of lowering
     max_depth: float = LIMITS.descent_depth  # largest depth below the start of an attempt [m]
 
     def __post_init__(self) -> None:

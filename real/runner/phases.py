@@ -12,7 +12,7 @@ _ADVICE = "; inspect the robot, then start a new run"
 
 
 def with_advice(text: str) -> str:
-    """The reason of a stop, followed once by what to do after it."""
+    """The reason of a stop with the advice for the operator, which is not appended a second time."""
     return text.removesuffix(_ADVICE) + _ADVICE
 
 

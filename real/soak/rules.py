@@ -7,9 +7,9 @@ from typing import Any
 
 from gelflow.real.soak.session_facts import SessionFacts
 
-MAX_PUSH = 1e-3  # of a part in the grip without a stop [m]
-_MOVED = 50e-6  # a reference that changes less after a latch is a hold [m]
-_BEYOND = 2.1e-3  # a reference less outside the workspace is within the driver's margin [m]
+MAX_PUSH = 1e-3  # largest slip of a part in the grip without a stop [m]
+_HOLD_MOTION = 50e-6  # largest change of the reference after a latch that counts as a hold [m]
+_WORKSPACE_MARGIN = 2.1e-3  # largest distance of a reference outside the workspace that the driver allows [m]
 
 
 @dataclass(frozen=True)
@@ -29,8 +29,8 @@ RULES: Mapping[str, Callable[[RunFacts], bool]] = MappingProxyType(
     {
         "called inserted, but is not": lambda run: run.outcome == "inserted" and not run.truth.get("inserted", False),
         "pushed in the grip without a stop": lambda run: run.truth.get("largest_push", 0.0) > MAX_PUSH,
-        "motion after a latch": lambda run: run.session.moved_after_latch > _MOVED,
-        "target outside was not refused": lambda run: run.session.outside > _BEYOND,
+        "motion after a latch": lambda run: run.session.moved_after_latch > _HOLD_MOTION,
+        "target outside was not refused": lambda run: run.session.outside > _WORKSPACE_MARGIN,
         "hang": lambda run: run.exit_code is None or run.idle > run.allowed_idle,
         "unexpected exception": lambda run: "Traceback" in run.errors or run.exit_code not in (0, 1, 2, 143, None),
         "no stop was sent": lambda run: run.session.moved and not run.session.stop_recorded,

@@ -24,7 +24,7 @@ _STOPS = ("stopped", "arm stopped")  # names of events
 class SessionFacts:
     """Facts of one session. Lengths in metres, times in robot time."""
 
-    readable: str  # yes, recovered, no, or the reason why there is none
+    readable: str  # "yes", "recovered", "no", or "no session"
     states: tuple[str, ...] = ()  # of the supervisor, without repetitions
     latched_at: float | None = None  # time of the first latch [s]
     reason: str = ""  # of the stop

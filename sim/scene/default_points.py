@@ -1,7 +1,8 @@
 """Default density of contact points, and the widths and gaps that decide whether sampled points can miss a shape.
 
-A face of the partner that is at least three spacings wide contains points in two directions, also where it coincides
-with a face of the sampled geometry, whose outermost points are then on edges, at distance 0.
+The default spacing is at most a third of the smallest width of a partner. A face of the partner then contains points in
+both directions, even where it coincides with a face of the sampled geometry: the outermost points are then on edges of
+the partner, at distance 0, where they have no force.
 """
 
 import math
@@ -46,8 +47,9 @@ def smallest_width(geom: GeomDef) -> float:
 def choose_spacings(sampled: Mapping[str, GeomDef], partners: Mapping[str, Collection[GeomDef]]) -> dict[str, float]:
     """The spacing of each point set with a default density [m]; infinite for a box against planes: its corners.
 
-    Of two sets against each other's geometry, only the one with fewer points adapts to the other. Only boxes have a
-    default against planes alone, and only boxes and cylinders against other shapes; other sets get no spacing.
+    If two sets are in contact with each other's geometry, only the set with fewer points adapts its spacing to the
+    other geometry. Only boxes have a default against planes alone, and only boxes and cylinders against other shapes;
+    other sets get no spacing.
 
     Parameters
     ----------
@@ -77,7 +79,7 @@ def choose_spacings(sampled: Mapping[str, GeomDef], partners: Mapping[str, Colle
 
 
 def _spacing(geom: GeomDef, partners: Collection[GeomDef]) -> float:
-    """At most a third of the smallest width of each partner, but at most `MAX_DEFAULT_POINTS` points."""
+    """Spacing [m]: at most a third of the smallest width of each partner, or more to keep to `MAX_DEFAULT_POINTS`."""
     spacing = min((smallest_width(partner) for partner in partners), default=math.inf) / _PER_WIDTH
     spacing = min(spacing, 2 * float(geom.size.max()))  # the number of spacings per side has a lower bound
     while _number_of_points(geom, spacing) > MAX_DEFAULT_POINTS:
@@ -104,7 +106,7 @@ def default_surface(geom: GeomDef, spacing: float) -> tuple[Array, Array]:
 
 
 def largest_gap(geom: GeomDef, points: Array, faces: Collection[str]) -> float:
-    """Diameter of the largest ball centred on sampled faces of a geometry that contains no point [m].
+    """Diameter of the largest ball that contains no point and is centred on the sampled faces of a geometry [m].
 
     The wall of a cylinder with points on both ends counts as sampled.
     """

@@ -44,7 +44,7 @@ _GRASP_STATE = ("q", "anchors", "anchored")
 _STATE = ("v", *_GRASP_STATE)
 _CLEAR_HEIGHT = 0.1  # [m] height of the part while the gripper closes, clear of the hole
 _OUTLINE_TOLERANCE = 0.3e-3  # [m] penetration of the hole's walls that is allowed for an inserted part
-_CONTACT = 1 / 3  # of the shear that stops a descent: above it, contact is left at its end; as in a lab file
+_CONTACT_SHARE = 1 / 3  # shear that counts as contact at the end of a descent / `stop_shear`, as in a lab file
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class AttemptResult:
     divisor: Array  # shape (n,), in newtons: normalization of the flow maps
     height: Array  # [m], shape (n,): highest corner of the part's lower face above the hole's floor
     # Shape (n,): the lower face is inside the hole and below the task's success height, contact did not stop the
-    # descent nor is left at its end, and no step failed.
+    # descent, there is no contact at its end, and no step failed.
     inserted: NDArray[np.bool_]
     failed: NDArray[np.bool_]  # shape (n,): a simulation step failed
     depth: Array  # [m], shape (n,): of the gripper's target below its start when the descent ended, by contact or not
@@ -239,7 +239,7 @@ class InsertionAttempts:
     def _in_contact(self, rows: Rows, change: Array) -> Mask:
         """Whether the shear along a finger shows contact, after its `change` (n, markers, 2) [N] in a descent."""
         along = change[..., 0].reshape(len(rows), len(PADS), -1).mean(2)
-        return np.asarray(along.max(1) > _CONTACT * self.stop_shear[rows])
+        return np.asarray(along.max(1) > _CONTACT_SHARE * self.stop_shear[rows])
 
     def _simulate(self, rows: Rows, jitter: Array, steps: list[int]) -> Trajectory:
         """The descent of the grippers `rows`, read after `steps`."""

@@ -145,7 +145,7 @@ class SensorModel:
         if (noise := self._level["noise"][rows]).any():
             level = noise[:, None] * self._noise_factor[rows]
             reading += level[..., None] * rng.standard_normal(reading.shape)
-        return self._without_dead(reading, rows)
+        return self._with_dead_filled(reading, rows)
 
     def _lag(self, forces: Array, rows: NDArray[np.int64], interval: float) -> Array:
         """The gel as a standard linear solid: force f, delayed part y with τ ẏ = f − y, deformation (1 − c) f + c y.
@@ -176,7 +176,7 @@ class SensorModel:
         scaled[..., :2] = rotated(scaled[..., :2], turn)
         return scaled
 
-    def _without_dead(self, reading: Array, rows: NDArray[np.int64]) -> Array:
+    def _with_dead_filled(self, reading: Array, rows: NDArray[np.int64]) -> Array:
         """Markers that are not found replaced by the inverse-distance mean of the nearest found ones."""
         env, marker = np.nonzero(~self._found[rows])
         if not len(env):

@@ -106,7 +106,7 @@ class ScaledClock:
                 self.grant(slot, math.inf)
 
     def absorb_delay(self) -> None:
-        """Continue robot time from where it is held up; only the process of the simulated cell calls this."""
+        """Let robot time continue without a jump after it stood still; only the simulated cell's process calls this."""
         if self._sync is not None:
             self._sync.absorb_delay(self.factor)
 

@@ -199,7 +199,7 @@ def worker_pool(count: int) -> Iterator[ProcessPoolExecutor]:
 
 
 def _end_with_parent(ending: Event) -> None:
-    """Let this worker end when its parent ends, or sets `ending`; the signals of a terminal are the parent's."""
+    """Let this worker end when its parent ends or sets `ending`; signals of the terminal are left to the parent."""
     parent = multiprocessing.parent_process()
     assert parent is not None, "for worker processes"
     for number in SIGNALS:

@@ -79,7 +79,7 @@ class Part:
             raise UsageError(f"the clearance of a {self.shape} must be equal along x and y, got {list(self.clearance)}")
 
     def to_json(self) -> dict[str, Any]:
-        """As plain data, for task descriptions; without the places of meshes, and without a mesh that is not there."""
+        """As plain data, for task descriptions; without paths of meshes, and without fields of an absent hole mesh."""
         values = dataclasses.asdict(self)
         absent = () if self.hole_mesh else ("hole_mesh", "hole_scale", "hole_origin")
         for key in ("mesh_file", "hole_file", *absent):

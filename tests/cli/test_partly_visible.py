@@ -62,7 +62,7 @@ def test_the_lab_file_accepts_the_calibration_of_a_partly_visible_grid(
     assert values["visible_rows"] == [1, 18] and values["visible_cols"] == [1, 12] and values["tracked_share"] > 0.97
 
 
-def test_a_calibration_without_the_printed_grid_names_the_way_out(tmp_path: Path) -> None:
+def test_a_calibration_without_the_printed_grid_names_the_missing_options(tmp_path: Path) -> None:
     image = picture(tmp_path / "rest.png", cut=(48, 0))
     assert calibrate(image, tmp_path / "left.json") == 0 and load_calibration(tmp_path / "left.json").cols == 12
     text = EXAMPLE.read_text().replace("pixels_per_mm = 15.7", 'calibration = "left.json"', 1)

@@ -18,7 +18,7 @@ def counted(worlds: list[dict[str, Any]]) -> dict[str, Any]:
 
     A world counts as covered when every parameter that is reported as known lies in its interval. Worlds that cannot
     be recorded, because the gripper loses the part or no attempt has contact, count as refused. Trainings draw from the
-    joint distributions of fits that converged, so that only these count as jointly covered.
+    joint distributions of fits that converged, so only these can count as jointly covered.
     """
     done = [world for world in worlds if "refused" not in world]
     known = [entry for world in done for entry in world["known"].values()]

@@ -32,10 +32,10 @@ def measure_plan(
 ) -> dict[str, Any]:
     """Widths of the intervals from a plan and from five insertions, two attempts of each, in the worlds of seeds.
 
-    Widths are those at the true parameters, from the Fisher information (`expected`; `expected_half` with one attempt
-    of each insertion); in the first `fits` worlds also those of calibrations, without held-out attempts (`fitted`). A
-    width is relative to that of the prior. `ratio` of a world is that of the geometric means of the widths, planned to
-    unplanned: at most 1 means that the plan gives the same or better.
+    `expected` are the widths at the true parameters, from the Fisher information; `expected_half` are the same, with
+    only one attempt of each of the five insertions. In the first `fits` worlds, `fitted` are the widths of calibrations
+    without held-out attempts. A width is relative to that of the prior. `ratio` of a world is the geometric mean of the
+    widths from the plan over that from the insertions: at most 1 where the plan gives the same or narrower intervals.
     """
     worlds: list[dict[str, Any]] = []
     for seed in seeds:

@@ -142,7 +142,7 @@ def _calibrated(world: World, settings: FitSettings | None, processes: int) -> C
 
 
 def evaluate(checkpoint: Path, world: World, episodes: int) -> EvaluationResult:
-    """Success of a policy of the insertion in a world, whose part may be another one than that of its training."""
+    """Success of an insertion policy in a world; the part may differ from that of the policy's training."""
     table = FULL_RANDOMIZATION.replace(**{**LAB, **world.values})
     scene = insertion_scene(world.task, friction=world.friction)
     envs = min(_ENVS, episodes)

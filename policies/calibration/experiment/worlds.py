@@ -27,7 +27,10 @@ _AS_PUBLISHED = ("dead_markers", "noisy_markers", "crosstalk", "gel_creep", "gel
 
 
 def widened(table: Randomization) -> Randomization:
-    """The table with ranges from a third of the lower limit to three times the upper one; of heights three times."""
+    """The table with ranges from a third of the lower limit to three times the upper one.
+
+    The range of the grasp height becomes three times as wide, about its middle.
+    """
     changes = {}
     for name in table:
         given = table[name].distribution

@@ -1,7 +1,7 @@
 """Readings of the pads from the shear forces of the markers: resampling, crosstalk, gain, rotation of the camera.
 
 The markers that are printed on a gel are rarely those of a policy's grid. The gel then shows the forces at the printed
-markers, which mix with their neighbours, and the runner interpolates what it tracks to the policy's grid. Both
+markers, which mix with their neighbours, and the runner interpolates the tracked vectors to the policy's grid. Both
 interpolations are linear and smooth the edges of a contact, as crosstalk would.
 """
 
@@ -43,10 +43,10 @@ class PadModel:
             self._neighbours = _nearest([printed.positions()] * len(grids))
 
     def crosstalk_on_grid(self, crosstalk: Array) -> Array:
-        """The crosstalk between markers of the grid that changes a field of constant curvature like that of the print.
+        """The crosstalk between markers of the policy's grid that is equivalent to `crosstalk` between printed markers.
 
-        The interpolation between both is part of it. Changes are medians, because neighbours are missing at the borders
-        of the grid.
+        Equivalent means the same change of a field of constant curvature. The interpolations between both grids are
+        included. Changes are medians, because neighbours are missing at the borders of the grid.
         """
         field = np.concatenate([(grid.positions() ** 2).sum(1) for grid in self._grids])[:, None]
         on_grid = np.median(field[self._neighbours_on_grid].mean(1) - field)

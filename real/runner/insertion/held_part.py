@@ -132,7 +132,7 @@ class HeldPart:
         )
 
     def _move_to(self, planar_pose: PlanarPose, height: float, *, fast: bool = False) -> bool:
-        """Move towards a start pose; False after contact, whose height is then that of the rim."""
+        """Move towards a start pose. After contact returns False, and the height of the contact becomes the rim's."""
         contact = self._guard.move(
             self._pose(planar_pose, height),
             threshold=self.thresholds.fast if fast else self.thresholds.contact,
@@ -150,10 +150,11 @@ class HeldPart:
     def descend(
         self, planar_pose: PlanarPose, observer: TactileObserver, depth_below: float, stop_shear_mm: float | None = None
     ) -> Descent:
-        """Descend by `depth_below` [m] while `observer`, whose reference was taken at the start, keeps the readings.
+        """Descend by `depth_below` [m]; `observer`, whose reference was taken at the start, stores the readings.
 
-        `stop_shear_mm` replaces that of the lab file. As there, a gel on which the weight shows less stops earlier.
-        Raises PartSlipped when the pads do not show the part's weight at the start, or the part slips by too much.
+        `stop_shear_mm` replaces that of the lab file, and like it is scaled by the weight that the pads show (see
+        `check_grasp`). Raises PartSlipped when the pads do not show the part's weight at the start, or the part slips
+        by too much.
         """
         self._observe(observer)
         self._check_weight()
@@ -191,10 +192,10 @@ class HeldPart:
         return Descent(contact is not None, slip.slipped, observer.readings[-1])
 
     def lower(self, planar_pose: PlanarPose) -> TactileReading | None:
-        """Lower the part into the hole; None when it arrived, or stands on the floor.
+        """Lower the part into the hole. Returns None when the part arrived at the end of the motion or on the floor.
 
-        After contact above the floor returns the reading at rest; near the taught rim, its height becomes that of the
-        rim.
+        After contact above the floor returns the reading at rest. The height of a contact near the taught rim becomes
+        the height of the rim.
         """
         part, space = self._lab.part, self._lab.workspace
         end = max(part.insert_to + self.height_offset, space.height_min)
@@ -229,7 +230,7 @@ class HeldPart:
             self._pose((x, y, yaw), height),
             threshold=self.thresholds.stuck,
             measure=downward,
-            baseline=self._baseline,  # before the first attempt the weight of the part: on a soft gel more than `stuck`
+            baseline=self._baseline,  # before the first attempt the shear by the weight, above `stuck` on a soft gel
         )
         if contact is not None:
             self._event("stuck", contact)

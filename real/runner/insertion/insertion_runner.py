@@ -114,7 +114,7 @@ class InsertionRunner:
                 self._correct(part, attempt)
         except (HoleNotFound, PartSlipped) as error:
             outcome = str(error)
-        self._hand_back(number, part)
+        self._raise_and_hand_back(number, part)
         return outcome
 
     def _end_lost(self, number: int, part: HeldPart | None, evidence: str) -> str:
@@ -129,7 +129,7 @@ class InsertionRunner:
         self._motion.expect_part(True)  # with its present width
         if part is not None:
             part.retreat(self._lab.part.load_height)
-        self._give_back(number)
+        self._release_to_operator(number)
         return evidence
 
     def check_plan(self, supervisor: Supervisor) -> list[str]:
@@ -321,12 +321,12 @@ class InsertionRunner:
         part.check_release(self._open)
         self._retreat_empty()
 
-    def _hand_back(self, number: int, part: HeldPart) -> None:
+    def _raise_and_hand_back(self, number: int, part: HeldPart) -> None:
         """Raise the part and release it to the operator."""
         part.retreat(self._lab.part.load_height)
-        self._give_back(number)
+        self._release_to_operator(number)
 
-    def _give_back(self, number: int) -> None:
+    def _release_to_operator(self, number: int) -> None:
         """Release the part to the operator."""
         self._operator.take(number)
         self._motion.supervisor.phases.enter(Phase.RELEASE)

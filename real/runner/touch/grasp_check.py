@@ -1,11 +1,11 @@
 """Check of the pads at every grasp: both must show the part's weight, which also scales the contact thresholds.
 
 The weight of the grasped part pulls the markers of both pads towards the fingertips. A camera whose image shows no such
-change, or a change in another direction, is not a sense of touch: it repeats an old image, belongs to another finger or
-is mounted differently than the lab file states. Fingers that close on a part without parallel sides also shear the pads
-sideways, with opposite forces on the part; as the axes y of the pads are opposite too, this is the mean of both y. The
-size of the change is a force known to both pads. A threshold below it is exceeded before a held part can slip: contact
-from below first takes the weight off the pads.
+change, or a change in another direction, does not observe its pad: it repeats an old image, belongs to another finger
+or is mounted differently than the lab file states. Fingers that close on a part without parallel sides also shear the
+pads sideways, with opposite forces on the part; as the y axes of the pads are opposite too, this shear is the mean of
+both y components. The size of the change gives the scale of the thresholds. A threshold below it is exceeded before a
+held part can slip, because contact from below first takes the weight off the pads.
 """
 
 from collections.abc import Sequence
@@ -18,10 +18,10 @@ from gelflow.errors import PeerError
 from gelflow.real.runner.lab import DescentSettings
 from gelflow.real.runner.touch.observer import TactileReading
 
-_WEIGHT_FRACTION = 0.7  # of the change by the weight: the largest contact threshold
-_FAST_FRACTION = 0.3  # of it: the smallest threshold of fast motions, in which the motion alone gave 0.14
+_WEIGHT_FRACTION = 0.7  # largest contact threshold / change by the weight
+_FAST_FRACTION = 0.3  # smallest threshold of fast motions / change by the weight; the motion alone caused 0.14
 _NOISE_FACTOR = 5.0  # a change is significant above this multiple of the noise of one reading
-_LEAST_NOISE = 3e-4  # of the mean change of a pad, for a few readings that agree by chance [mm]
+_LEAST_NOISE = 3e-4  # lower limit of the estimated noise, because a few readings may agree by chance [mm]
 _LARGEST_ANGLE = 45.0  # between the change and the finger's axis [°]
 _SIDES = ("left", "right")
 
@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 
 
 class TouchImplausible(PeerError):
-    """The pads do not show what the grasp must have caused."""
+    """The pads do not show the change that a grasp or a release must have caused."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ def check_grasp(
     if not settings.weight_check:
         return GraspCheck(weight, noise, nominal)
     least = _NOISE_FACTOR * noise
-    balanced = float(weight[:, 1].mean())  # by the grip, not by the weight
+    grip_shear = float(weight[:, 1].mean())  # sideways, by the grip and not by the weight
     for side, (x, y) in zip(_SIDES, weight, strict=False):
         size = float(np.hypot(x, y))
         if size < least:
@@ -89,7 +89,7 @@ def check_grasp(
                 f"{side} camera: the pad shows no weight of the grasped part ({size:.4f} mm of mean shear, noise "
                 f"{noise:.4f} mm); check that this camera is live, on its finger, and that nothing supports the part"
             )
-        if x < least or abs(np.degrees(np.arctan2(y - balanced, x))) > _LARGEST_ANGLE:
+        if x < least or abs(np.degrees(np.arctan2(y - grip_shear, x))) > _LARGEST_ANGLE:
             angle = float(np.degrees(np.arctan2(y, x)))
             raise TouchImplausible(
                 f"{side} camera: the weight of the grasped part points {angle:+.0f}° away from the fingertip; "
@@ -98,8 +98,9 @@ def check_grasp(
     contact = min(nominal.contact, _WEIGHT_FRACTION * float(weight[:, 0].min()))
     if contact < least:
         raise TouchImplausible(
-            f"contact cannot be told from noise: its threshold would be {contact:.4f} mm, the noise is {noise:.4f} mm; "
-            "the gels are too stiff or the part is too light (descent.weight_check = false omits this check)"
+            f"contact cannot be distinguished from noise: its threshold would be {contact:.4f} mm, the noise is "
+            f"{noise:.4f} mm; the gels are too stiff or the part is too light (descent.weight_check = false omits this "
+            "check)"
         )
     scale = contact / nominal.contact
     fast = max(contact, _FAST_FRACTION * float(weight[:, 0].min()))
@@ -107,7 +108,7 @@ def check_grasp(
 
 
 def check_release(held: Sequence[TactileReading], released: Sequence[TactileReading], check: GraspCheck) -> None:
-    """Raise TouchImplausible when a pad shows no change as the fingers open: the run before it was not observed."""
+    """Raise TouchImplausible when a pad shows no change as the fingers open: it has not observed the insertion."""
     change = np.abs(_mean(released) - _mean(held)).max(axis=1)
     for side, size in zip(_SIDES, change, strict=False):
         if size < _NOISE_FACTOR * check.noise:

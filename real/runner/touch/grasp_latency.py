@@ -14,9 +14,11 @@ from gelflow.protocols import CameraImage, GripperState
 from gelflow.real.camera.latency import LatencyEstimate, combine_latencies, estimate_latency
 from gelflow.time_sync import RUNNER
 
-_AROUND = 0.4  # before and after the rise of the force, in which images are tracked [s]
-_RISEN = 0.1  # of the largest force, above which it has risen
-_TOLERATED = 5e-3  # beyond the lab file: its rounding, the gripper's own delay, the jitter of this computer [s, wall]
+_TRACKED_SPAN = 0.4  # before and after the rise of the force, in which images are tracked [s]
+_ONSET_SHARE = 0.1  # of the largest force, above which the force counts as risen
+# Latency beyond that of the lab file that is ignored [s, wall]: rounding in the file, the gripper's own delay, and the
+# jitter of this computer.
+_TOLERANCE = 5e-3
 
 
 @dataclass
@@ -27,7 +29,7 @@ class GraspSignals:
     images: dict[int, list[CameraImage]] = field(default_factory=dict)  # by sensor
 
     def latencies(self, trackers: Sequence[TrackerConfig]) -> list[LatencyEstimate | None]:
-        """The latency of each camera beyond the one that its stamps contain already; None where it is not visible.
+        """The latency of each camera beyond that already subtracted from its stamps; None where it is not visible.
 
         `trackers` are the tracker settings of each sensor. Images that cannot be tracked are omitted.
         """
@@ -37,11 +39,11 @@ class GraspSignals:
         values = np.array([value for _, value in self.force])
         if not values.size or not np.isfinite(values).any():
             return None
-        risen = self.force[int(np.argmax(values > _RISEN * np.nanmax(values)))][0]
+        risen = self.force[int(np.argmax(values > _ONSET_SHARE * np.nanmax(values)))][0]
         change: list[tuple[float, float]] = []
         tracker: MarkerTracker | None = None
         for image in self.images.get(sensor, []):
-            if abs(image.stamp - risen) > _AROUND:
+            if abs(image.stamp - risen) > _TRACKED_SPAN:
                 continue
             try:
                 pixels = decode_image(image.data)
@@ -63,22 +65,22 @@ class LatencyMonitor:
     """Collects the signals of grasps and keeps the resulting latencies of each camera.
 
     `image` and `gripper_state` are called in the threads of the devices, for every image and every state.
-    `clock_factor` is robot time over wall time: a mock robot's delays by this computer count as often.
+    `clock_factor` is robot time over wall time; it converts the tolerance, a wall time, to robot time.
     """
 
     def __init__(self, names: Sequence[str], trackers: Sequence[TrackerConfig], *, clock_factor: float) -> None:
         self._names, self._trackers = names, trackers
-        self._tolerated = _TOLERATED * clock_factor  # [s]
+        self._tolerance = _TOLERANCE * clock_factor  # [s]
         self._signals: GraspSignals | None = None
         self.estimates: list[list[LatencyEstimate]] = [[] for _ in names]
 
     def image(self, sensor: int, image: CameraImage) -> None:
-        """Note an image during a grasp."""
+        """Store an image while a grasp is in progress."""
         if (signals := self._signals) is not None:
             signals.images.setdefault(sensor, []).append(image)
 
     def gripper_state(self, state: GripperState) -> None:
-        """Note a state during a grasp."""
+        """Store the measured force while a grasp is in progress."""
         if (signals := self._signals) is not None:
             signals.force.append((state.stamp, state.force))
 
@@ -100,11 +102,11 @@ class LatencyMonitor:
 
     @property
     def excess(self) -> float:
-        """Time by which images are at least later than their stamps, the largest of all grasps and cameras [s]."""
+        """Lower bound of the delay of images after their stamps, the largest of all grasps and cameras [s]."""
         return max((self._excess(known) for known in self.estimates), default=0.0)
 
     def _excess(self, known: Sequence[LatencyEstimate]) -> float:
-        return max((estimate.low for estimate in known if estimate.low > self._tolerated), default=0.0)
+        return max((estimate.low for estimate in known if estimate.low > self._tolerance), default=0.0)
 
     def warnings(self) -> list[str]:
         """One line for each camera whose images are certainly later than the lab file states."""

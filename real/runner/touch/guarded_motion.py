@@ -20,8 +20,9 @@ from gelflow.time_sync import RUNNER
 
 # From the reception of an image that shows contact to the arm at rest: tracking, hold, lag of the arm [s].
 _REACTION_TIME = 0.03
-# Without a readable image, after which the arm holds: 250 ms less the longest wait of the observer and tracking [s].
-_BLIND_TIME = LIMITS.image_age - 0.03
+# Age of the newest readable image at which the arm holds [s]: 250 ms, less the longest wait of the observer and
+# tracking.
+_UNREADABLE_TIME = LIMITS.image_age - 0.03
 _REST_TIME = 0.1  # from a hold until the arm and the newest images are at rest [s]
 _FREE_OVERSHOOT = 0.5e-3  # after contact in motions up, sideways and above the range in which the rim is searched [m]
 _DOWNWARD = 0.05e-3  # a target further below the arm than this is a motion towards contact [m]
@@ -135,7 +136,7 @@ class GuardedMotion:
                     if on_reading(reading) or change > threshold:
                         self._motion.hold()
                         return Contact(reading, change)
-                if self.observer.blind_time() >= _BLIND_TIME:
+                if self.observer.blind_time() >= _UNREADABLE_TIME:
                     self._motion.hold()
                     self._wait_until_readable()
                     self._motion.go(target, speed=speed, guarded=True)
@@ -160,7 +161,7 @@ class GuardedMotion:
         values = {"camera": self.observer.blind_camera, "seconds": self.observer.blind_time()}
         self._recorder.event("pad not readable", values)
         begun = self._clock.now() - self.observer.blind_time()
-        while self.observer.blind_time() >= _BLIND_TIME:
+        while self.observer.blind_time() >= _UNREADABLE_TIME:
             if (seconds := self._clock.now() - begun) > self._lab.limits.stale_frame:
                 raise TouchLost(
                     f"camera {self.observer.blind_camera}: no readable image in time for {seconds:.2f} s with a part "

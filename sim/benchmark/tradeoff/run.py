@@ -36,10 +36,9 @@ class MotionResult:
 
     poses: Array  # of all bodies (frames + 1, bodies, 7)
     field: Array  # last evaluated marker forces over their weights (frames + 1, markers, 3)
-    gradient: (
-        Array | None
-    )  # of the tactile loss with respect to controls, times their standard deviation (WINDOW, changing controls)
-    look: int  # frame of the motion's evaluation time
+    # Of the tactile loss with respect to controls, times their standard deviation (WINDOW, changing controls).
+    gradient: Array | None
+    evaluation_frame: int  # frame of the motion's evaluation time
     iterations: int  # Newton iterations
     halved: int  # steps that were split into substeps
 
@@ -79,7 +78,7 @@ class MotionBenchmark:
             raise UsageError(f"{scene.path}: a step of {scene.step} s must divide {FRAME} s, the time between controls")
         self.sim = Simulator(scene, threads=1)
         self.motion = reference_motion(scene)
-        self.look = round(self.motion.evaluation_time / FRAME)
+        self.evaluation_frame = round(self.motion.evaluation_time / FRAME)
         self.controls: NDArray[Any] = self.motion.step_controls(FRAME).astype(self.sim.dtype)[:, None]
         weights = np.concatenate([np.broadcast_to(p.weights, len(p.positions)) for p in scene.pads])
         self._weights = weights[:, None]
@@ -108,7 +107,7 @@ class MotionBenchmark:
         iterations, halved = int(sim.iterations[0]), int(sim.halved[0])
         poses, fields, starts = [sim.poses()[0].copy()], [self._read()], {}
         for frame, u in enumerate(self.controls, 1):
-            if gradient and 0 <= self.look - frame < WINDOW:
+            if gradient and 0 <= self.evaluation_frame - frame < WINDOW:
                 starts[frame] = {name: np.array(getattr(sim, name)) for name in _STATE}
             sim.step(u, self.steps)
             poses.append(sim.poses()[0].copy())
@@ -118,7 +117,7 @@ class MotionBenchmark:
             poses=np.array(poses, float),
             field=np.array(fields if onto is None else _resampled(fields, self.scene.pads, onto.pads)),
             gradient=self._gradient(starts, fields) if gradient else None,
-            look=self.look,
+            evaluation_frame=self.evaluation_frame,
             iterations=int(sim.iterations[0]) - iterations,
             halved=int(sim.halved[0]) - halved,
         )
@@ -146,7 +145,7 @@ class MotionBenchmark:
             u = np.repeat(self.controls[frame - 1 : frame], self.steps, axis=0)
             start: dict[str, Any] = {**starts[frame]}
             trajectory = sim.rollout(u, **start, read_after=(self.steps,) if reads else ())
-            held = min(self.every, self.look - frame + 1)
+            held = min(self.every, self.evaluation_frame - frame + 1)
             grad_tactile = scale * held * fields[frame] / self._weights if reads else None
             at_end = {name: np.zeros(getattr(trajectory, name).shape) for name in ("q", "v")}
             for name, values in at_end.items():
@@ -217,16 +216,15 @@ def _relative(found: Array, true: Array) -> float:
 
 
 def _flow(run: MotionResult, reference: MotionResult) -> Array:
-    """The vectors of the flow map at the look, against the start, (markers, 2).
+    """The vectors of the flow map at the evaluation time, relative to the start of the motion, (markers, 2).
 
-    Where all forces of a scene are small, a tenth of the largest is the floor, instead of the noise of a real sensor.
+    The smallest divisor is that of `MIN_DIVISORS`, or a tenth of the largest shear where this is smaller.
     """
     shear = np.linalg.norm(reference.field[..., :2] - reference.field[0, :, :2], axis=-1)
     floor = min(MIN_DIVISORS["N"], _FLOOR * float(shear.max()))
     one = (1, -1, 1, 2)  # sensors, rows, columns: how markers are arranged makes no difference to the vectors
-    image, _ = normalize(
-        run.field[reference.look, :, :2].reshape(1, *one), run.field[0, :, :2].reshape(one), min_divisor=floor
-    )
+    evaluated, start = run.field[reference.evaluation_frame, :, :2], run.field[0, :, :2]
+    image, _ = normalize(evaluated.reshape(1, *one), start.reshape(one), min_divisor=floor)
     return np.asarray(image).reshape(2, -1).T
 
 

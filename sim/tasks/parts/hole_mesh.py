@@ -44,10 +44,10 @@ def mesh_hole_outline(part: Part, outline_of_part: Outline) -> Outline:
     above = picture(mesh_hole(part), along=2, pixel=OUTLINE_PIXEL)
     with np.errstate(invalid="ignore"):
         free = ~(above.high > part.depth / 2)
-    return region_outline(_under(part, free, above, outline_of_part), above)
+    return region_outline(_region_under(part, free, above, outline_of_part), above)
 
 
-def _under(part: Part, free: NDArray[np.bool_], above: Picture, outline: Outline) -> NDArray[np.bool_]:
+def _region_under(part: Part, free: NDArray[np.bool_], above: Picture, outline: Outline) -> NDArray[np.bool_]:
     """The connected free pixels under the part."""
     from skimage import measure
 

@@ -82,7 +82,7 @@ def _mirror(given: TomlTable) -> tuple[str, ...]:
 
 
 def _hole_fields(hole: TomlTable, path: Path, shape: str) -> dict[str, Any]:
-    """The fields of a part that describe its hole; with a mesh, the clearance is that of the cuboid for now."""
+    """The fields of a part that describe its hole; with a mesh of the hole, `_fitted` sets the clearance later."""
     if "file" not in hole.check_keys((*_OUTLINE_HOLE, *_MESH_HOLE)).data:
         hole.check_keys(_OUTLINE_HOLE)
         both = shape != "box" or not isinstance(hole.data.get("clearance"), list)

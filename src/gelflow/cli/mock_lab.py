@@ -15,9 +15,9 @@ from gelflow.real.runner import lab
 if TYPE_CHECKING:
     from gelflow.hardware_mocks.robot import MockRobot
 
-# The limit of a recording's delay is wider still, since it measures the computer and not the robot: a write may take
-# some tenths of a second.
-_DISK = 4
+# Additional factor of the time limit of recordings, which depends on the disk of this computer and not on the robot: a
+# write may take some tenths of a second.
+_DISK_FACTOR = 4
 
 _VISIBLE_LINE = 0.3  # fraction of the dots of a visible line that are inside the image
 
@@ -56,7 +56,7 @@ def lab_for(robot: "MockRobot", *, jitter: float | None = None) -> lab.Lab:
         ),
         limits=_limits(MOCK_TIME_SCALE * factor)
         if jitter is None
-        else _limits(1.0, jitter * factor, disk=_DISK * factor),
+        else _limits(1.0, jitter * factor, disk=_DISK_FACTOR * factor),
         clock_factor=factor,
         time_sync=time_sync,
     )

@@ -114,7 +114,7 @@ class TimeIndex:
     def spread(self, topics: Sequence[str], start: float, end: float, count: int) -> Iterator[list[Record]]:
         """Records of `topics` in at most `count` chunks between two times [s], one chunk after the other.
 
-        The chunks are spread evenly over the time, and so are, nearly, the first of them.
+        The chunks are spread evenly over the time. Their order is such that those read so far are spread nearly evenly.
         """
         wanted = {number for topic in topics for number in self._topics.get(topic, [])}
         inside = [n for n in sorted(wanted) if self._starts[n] <= end and self._ends[n] >= start]
@@ -155,7 +155,7 @@ class TimeIndex:
 
 
 def refining_order(count: int) -> Iterator[int]:
-    """The numbers below `count` in an order in which every beginning is spread evenly: reversed bits."""
+    """The numbers below `count` in bit-reversed order: the first k of them are spread nearly evenly, for every k."""
     bits = max(count - 1, 0).bit_length()
     for k in range(1 << bits):
         number = int(f"{k:0{bits}b}"[::-1], 2) if bits else 0

@@ -1,4 +1,4 @@
-"""`gelflow robot` against the mock robot: the way out after a stop, and everything that is refused."""
+"""`gelflow robot` against the mock robot: the actions after a stop, and everything that is refused."""
 
 import dataclasses
 import json

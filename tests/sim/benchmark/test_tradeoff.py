@@ -145,14 +145,14 @@ def test_gradient_equals_finite_differences_of_the_loss(name: str, every: int) -
     chosen = np.flatnonzero(spread > 0)
 
     def loss() -> float:
-        field = task.run(gradient=False).field[task.look - WINDOW + 1 : task.look + 1]
+        field = task.run(gradient=False).field[task.evaluation_frame - WINDOW + 1 : task.evaluation_frame + 1]
         return float((field**2).sum() / (WINDOW * field.shape[1]))
 
     original = task.controls.copy()
     rng = np.random.default_rng(0)
     for frame in rng.choice(WINDOW, 2, replace=False):
         column = int(rng.integers(len(chosen)))
-        at, delta = (task.look - WINDOW + frame, 0, chosen[column]), 1e-6 * spread[chosen[column]]
+        at, delta = (task.evaluation_frame - WINDOW + frame, 0, chosen[column]), 1e-6 * spread[chosen[column]]
         values = []
         for sign in (1, -1):
             task.controls[:] = original

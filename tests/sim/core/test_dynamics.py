@@ -1,7 +1,7 @@
 """The core without contact: random trees compared with MuJoCo, motions compared with closed forms.
 
-Tolerances come from where the figure comes from: rounding for what is algebra, Newton's tolerance for what the solved
-equation keeps, and for what the integrator (BDF1) approximates, an error that halves with the step.
+Tolerances follow from the origin of each quantity: rounding for algebraic ones, Newton's tolerance for quantities that
+the solved equation conserves, and an error that halves with the step for those that the integrator (BDF1) approximates.
 """
 
 from collections.abc import Mapping

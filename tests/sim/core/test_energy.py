@@ -1,7 +1,7 @@
 """Energy: BDF1 never adds energy to free bodies on planes; in scenes the gain of a step is bounded.
 
 Free bodies are thrown on planes at random; hypothesis draws stiffness, damping, friction, step and centre of mass. The
-tolerance is ten times Newton's, relative to the energy at work.
+tolerance is ten times Newton's, relative to the energy involved.
 """
 
 import numpy as np

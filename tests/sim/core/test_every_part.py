@@ -1,6 +1,6 @@
 """A few steps with every part of the core; run by `make sanitize`, and as a quick check after changes of the core.
 
-Right or wrong is the other tests' business: here nothing may fail, and only finite numbers may come out.
+Other tests check the values: here every call must succeed with finite results.
 """
 
 from typing import Any

@@ -108,9 +108,9 @@ def test_error_estimate_of_a_step(at_rest: Array, integrator: str) -> None:
 
 
 def test_elastic_law_resolves_the_start_of_contact_to_one_step() -> None:
-    """An anchor is where the point is at the end of the step in which it touched: the shear lacks what was covered
-    between the touch and there. That is of first order under BDF2 too; and since the rest of a step can stay the same
-    while steps are halved, so can the error."""
+    """An anchor is set at the end of the step in which its point touches, so the shear lacks the displacement from the
+    touch to this time. The error is of first order under BDF2 too. Where a step and its half have the same time left
+    after the touch, halving does not change the error."""
     speed, fall, height = 0.2, 0.1, 1.039e-3
     touched, time = height / fall, 0.0256
     lacks = {}

@@ -1,6 +1,6 @@
 """Exactly coincident geometry: a marker on an edge, coplanar faces, a pad that overhangs its body.
 
-Lengths are powers of two, so that what coincides does so in single precision too.
+Lengths are powers of two, so that the geometry coincides exactly in single precision too.
 """
 
 from itertools import product
@@ -159,8 +159,8 @@ def test_coplanar_faces_have_no_contact_force(boxes: dict[str, Any], law: str, p
 @pytest.mark.parametrize("law", FRICTION_LAWS)
 @pytest.mark.parametrize("boxes", [SAME, HOLE], ids=["on a box of its size", "in a hole of its size"])
 def test_load_on_coincident_faces_gives_a_vertical_force(boxes: dict[str, Any], law: str, precision: str) -> None:
-    """On the box of its size by the nine points inside its face, as those on its edges stay on its edges; in the hole
-    by all twenty-five. The walls beside it push as much from each side."""
+    """On a box of equal size nine points carry the load: those inside the face, since points on the edges have no
+    force. In the hole all twenty-five carry it. The walls beside the box push equally from each side."""
     sim = fitted(boxes, law, precision, (0, 0, -8))
     sim.step(np.zeros(0), 1000)
     sim.check()

@@ -1,7 +1,7 @@
 """Gradients exactly at kinks: finite, repeatable, and those of the mode that the step takes.
 
-Numbers are powers of two, so that a state lies on a border to the last bit; what moves there is held there by its joint
-or by the balance of its forces. The state is read at the start and after each step.
+Numbers are powers of two, so that a state is exactly at the border of two contact modes. A body stays there because of
+its joint or the balance of its forces. The state is read at the start and after each step.
 """
 
 from collections.abc import Callable

@@ -29,7 +29,7 @@ from gelflow.cli.options import (
 )
 from gelflow.cli.output import Output
 from gelflow.cli.prompt import read_line
-from gelflow.cli.way_out import way_out
+from gelflow.cli.stop_hint import hint_after_stop
 from gelflow.errors import GelflowError, UsageError
 from gelflow.interrupts import interruptible
 from gelflow.protocols import Policy
@@ -105,7 +105,7 @@ def run(args: argparse.Namespace) -> int:
             plan = dataclasses.replace(plan, on_motion=motion_observer(view, at_once))
             results = run_insertions(dataclasses.replace(plan, on_preflight=on_preflight))
         except GelflowError as error:
-            if hint := way_out(str(error), args.lab, moved=passed):
+            if hint := hint_after_stop(str(error), args.lab, moved=passed):
                 error.add_note(hint)
             raise
     output.console.print(insertion_table(results))

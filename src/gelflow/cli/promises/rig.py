@@ -204,7 +204,8 @@ class Rig:
             while when is not None and not when(self.robot.cell.progress()):
                 if process.ended or time.monotonic() > end:
                     process.kill()
-                    raise FalseStop(process.last_line or f"the run did not get there within {_START_LIMIT:g} s")
+                    late = f"the run did not reach the awaited moment within {_START_LIMIT:g} s"
+                    raise FalseStop(process.last_line or late)
                 time.sleep(_POLL)
             at = time.monotonic()
             fault(process)

@@ -70,12 +70,12 @@ class LivePage:
             self._state.content = f"recording {self._path.name}"
         if "ended" in message:
             self._stop.disabled = True
-            self._state.content = f"**the run has ended: {message['ended']}**{self._how_to_look_again()}"
+            self._state.content = f"**the run has ended: {message['ended']}**{self._view_command()}"
             if self._shown is not None:
                 self._shown.show_end()
             time.sleep(_LAST_STATE)
 
-    def _how_to_look_again(self) -> str:
+    def _view_command(self) -> str:
         return "" if self._path is None else f"  \nlook at it again: `gelflow view {self._path}`"
 
     def _open(self, path: Path) -> None:

@@ -19,7 +19,7 @@ from gelflow.view.session.marks import Mark, descents, marks, phases
 from gelflow.view.session.moment import Moment
 
 _FORCE_AGE = 0.5  # of a force that is shown [s]
-_STORY = ("/event", "/attempt", "/decision")
+_EVENT_TOPICS = ("/event", "/attempt", "/decision")
 
 
 class RecordedSession:
@@ -44,7 +44,7 @@ class RecordedSession:
             self.description = self._description()
             self.notes: list[str] = []  # what the page cannot show, and why
             self.cell = self._cell()
-            story = list(self.reader.records(_STORY, damage=Damage()))
+            records = list(self.reader.records(_EVENT_TOPICS, damage=Damage()))
         except GelflowError:
             self.reader.close()
             raise
@@ -54,10 +54,10 @@ class RecordedSession:
             self.start = min((record.time for record in self._first_images()), default=self.start)
         self.marks: list[Mark] = []
         self.decisions: list[Record] = []
-        self._story: list[Record] = []
+        self._event_records: list[Record] = []
         self._phases: list[tuple[float, str]] = []
         self._descents: list[float] = []
-        self._add(story)
+        self._add(records)
         lab = self.description.get("lab") or {}
         self._settle = float(lab.get("descent", {}).get("settle", 0.0))  # rest before the reference images [s]
         self.markers = self.marker_reader()
@@ -101,9 +101,9 @@ class RecordedSession:
         self.index.extend(found)
         added = []
         for chunk in found:
-            if not has_topic(chunk, self._live.summary, _STORY):
+            if not has_topic(chunk, self._live.summary, _EVENT_TOPICS):
                 continue
-            messages = [entry for entry in self._live.chunk(chunk) if entry[0] in _STORY]
+            messages = [entry for entry in self._live.chunk(chunk) if entry[0] in _EVENT_TOPICS]
             added += [self._live.record(topic, message) for topic, message in messages]
         if added:
             self._add(added)
@@ -111,8 +111,8 @@ class RecordedSession:
 
     def _add(self, records: list[Record]) -> None:
         """Add events, attempts and decisions."""
-        self._story += records
-        of_topic = {topic: [record for record in self._story if record.topic == topic] for topic in _STORY}
+        self._event_records += records
+        of_topic = {topic: [r for r in self._event_records if r.topic == topic] for topic in _EVENT_TOPICS}
         self._phases = phases(of_topic["/event"])
         self._descents = descents(self._phases)
         self.decisions = of_topic["/decision"]

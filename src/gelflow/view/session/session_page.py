@@ -20,8 +20,8 @@ _FROM_START = "starts of the recordings"
 _PANEL_WIDTHS = (560, 440)  # of one session, and of each of two [px]
 _SLIDER_STEP = 0.01  # [s]
 _FOLLOW_PERIOD = 0.2  # between two pictures of a growing session [s]
-_FOLLOW_SHARE = 0.25  # of a core that these pictures take at most
-_LONGEST_PAUSE = 1.0  # between them, on a busy machine [s]
+_FOLLOW_SHARE = 0.25  # largest share of a core that these pictures take
+_LONGEST_PAUSE = 1.0  # longest time between two of these pictures, on a busy machine [s]
 
 
 class SessionPage:

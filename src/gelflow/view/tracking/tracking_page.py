@@ -91,7 +91,7 @@ class TrackingPage:
         self._note.content = f"zero at {since:.1f} s" if done else refused
 
     def add(self, step: TrackedImage) -> None:
-        """Show one image, if it is time for a picture and somebody looks."""
+        """Show one image, if the next picture is due and a browser shows the page."""
         if self._first is None:
             self._first = step.frame.stamp, time.perf_counter()
         self._curve.append((step.frame.stamp - self._first[0], *self._values(step)))

@@ -1,4 +1,4 @@
-"""Touch of the insertion runner over the wire: what the pads do not show is not done, in worlds unlike training."""
+"""Touch of the insertion runner over the wire, in worlds unlike training: a pad without the expected change ends it."""
 
 import socket
 from collections.abc import Iterator

@@ -1,13 +1,13 @@
-"""The command that helps after a run has stopped."""
+"""Hint after a stopped run: the command with which to continue."""
 
 import shlex
 from pathlib import Path
 
 
-def way_out(error: str, lab: Path, *, moved: bool) -> str:
+def hint_after_stop(error: str, lab: Path, *, moved: bool) -> str:
     """A hint for the error of a run with the lab file `lab`; empty when nothing has to be done at the robot.
 
-    `moved` when motion may have begun, after which the gripper may be above or in the hole with a part.
+    `moved` states that motion may have begun: the gripper may be above or in the hole, with a part.
     """
     options = f"--lab {shlex.quote(str(lab))}"
     for words, action in (
