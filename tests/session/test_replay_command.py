@@ -107,6 +107,16 @@ def test_the_command_reports_identical_decisions(
     assert drawn is not None and drawn.min() < 100 and drawn.shape[0] > 300
 
 
+def test_a_narrow_terminal_shortens_no_number(
+    real_session: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert main(["replay", str(real_session)]) == 0
+    wide = capsys.readouterr().out
+    monkeypatch.setenv("COLUMNS", "50")
+    assert main(["replay", str(real_session)]) == 0
+    assert re.findall(r"[+-]\d+\.\d{3}", capsys.readouterr().out) == re.findall(r"[+-]\d+\.\d{3}", wide) != []
+
+
 def test_the_command_prints_json(real_session: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["replay", str(real_session), "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)

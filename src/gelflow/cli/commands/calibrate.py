@@ -171,6 +171,7 @@ def _show(output: Output, result: Calibration) -> None:
 
 def _table(result: Calibration) -> Table:
     table = Table("parameter", "value", "95 % interval", "unit", "from the recordings")
+    table.columns[0].no_wrap = True
     for column in table.columns[1:3]:
         column.justify = "right"
     for estimate in result.estimates:
