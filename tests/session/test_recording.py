@@ -24,6 +24,7 @@ from gelflow.geometry import Pose
 from gelflow.observation import FlowMap
 from gelflow.protocols import ArmState, CameraImage, GripperState
 from gelflow.session.channels import JSON
+from gelflow.session.messages import Damage
 from gelflow.session.reader import SessionReader
 from gelflow.session.recorder import SessionRecorder
 from gelflow.session.records import Decision, describe_session, from_plain, to_json, to_plain
@@ -284,6 +285,11 @@ def test_misuse_of_the_recorder_raises_usage_errors(tmp_path: Path) -> None:
     with recorder:
         with pytest.raises(UsageError, match="sensor must be 0"):
             recorder.image(2, CameraImage(b"", 0.0, 0))
+        for sequence in (-1, 2**32):
+            with pytest.raises(UsageError, match=f"sequence number .*, got {sequence}"):
+                recorder.image(0, CameraImage(b"", 0.0, sequence))
+        with pytest.raises(UsageError, match="must be finite, got nan"):
+            recorder.image(0, CameraImage(b"", float("nan"), 0))
         with pytest.raises(UsageError, match="expected 3 numbers"):
             recorder.arm_command(0.0, [1, 2], TURN, kind="command")
         with pytest.raises(UsageError, match="'command' or 'applied'"):
@@ -357,8 +363,20 @@ def test_a_session_without_description_and_unknown_topics(tmp_path: Path) -> Non
             reader.description()
         with pytest.raises(UsageError, match="/left/image"):
             list(reader.records(["/camera"]))
+        with pytest.raises(UsageError, match=r"give \['/event'\]"):
+            list(reader.records("/event"))
     with pytest.raises(UsageError, match="not open"):
         reader.counts()
+
+
+def test_records_after_the_reader_is_closed_are_no_damage(session: Path) -> None:
+    damage = Damage()
+    with SessionReader(session) as reader:
+        records = reader.records(damage=damage)
+        next(records)
+    with pytest.raises(UsageError, match="not open"):
+        list(records)
+    assert not damage
 
 
 # Plain data

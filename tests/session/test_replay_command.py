@@ -280,6 +280,9 @@ def test_the_command_rejects_wrong_input_with_one_line(
         recorder.metadata({})
     with SessionRecorder(tmp_path / "odd.mcap", CLOCK) as recorder:
         recorder.metadata(describe_session(task=INSERTION, trackers=[{}] * 2, mounts=[{"lens": 1}] * 2))
+    with SessionRecorder(tmp_path / "one.mcap", CLOCK) as recorder:
+        described = describe_session(task=INSERTION, trackers=[{}] * 2, mounts=[{}] * 2, checkpoint=None)
+        recorder.metadata({**described, "trackers": [{}]})
     mine = tmp_path / "mine.png"
     mine.write_bytes(b"mine")
     for arguments, message in [
@@ -288,6 +291,7 @@ def test_the_command_rejects_wrong_input_with_one_line(
         ([str(tmp_path / "text.mcap")], "is not an MCAP file"),
         ([str(tmp_path / "moved.mcap")], "name the file with --checkpoint"),
         ([str(tmp_path / "bare.mcap")], "lacks 'task'"),
+        ([str(tmp_path / "one.mcap")], "2 camera mounts and 1 trackers; its task has 2 sensors"),
         ([str(tmp_path / "odd.mcap")], "unknown keys ['lens']"),
         ([str(real_session), "--checkpoint", str(cut)], "checkpoint"),
         ([str(real_session), "--out", str(tmp_path / "no folder" / "a.png")], "no folder does not exist"),

@@ -102,9 +102,11 @@ class SessionReader:
     def records(self, topics: Collection[str] | None = None, *, damage: Damage | None = None) -> Iterator[Record]:
         """All records, or those of `topics`, in the order of recording.
 
-        Raises UsageError for an unknown topic, and PeerError where the file is damaged. With `damage`, the reader
-        continues after damaged records and adds their number to it.
+        Raises UsageError for an unknown topic and when the reader is closed, and PeerError where the file is damaged.
+        With `damage`, the reader continues after damaged records and adds their number to it.
         """
+        if isinstance(topics, str):
+            raise UsageError(f"topics must be a list, got a text; give [{topics!r}]")
         if topics is not None and (unknown := set(topics) - set(PROTOBUF) - set(JSON)):
             known = ", ".join([*PROTOBUF, *JSON])
             raise UsageError(f"no such topic: {', '.join(sorted(unknown))}; the topics of a session are {known}")
@@ -113,10 +115,13 @@ class SessionReader:
             return  # the recorder has written no message
         read = _with_timing(topics)
         assert self._stream is not None
-        messages = ordered_messages(self._stream, summary, read, damage)
+        stream = self._stream
+        messages = ordered_messages(stream, summary, read, damage)
         camera_times: dict[str, tuple[int, float]] = {}  # per sensor, of the image that follows
         good = 0
         while True:
+            if stream.closed:  # since the last record
+                raise UsageError(f"{self.path}: the reader is not open")
             try:
                 channel, message = next(messages)
             except StopIteration:

@@ -127,6 +127,10 @@ def test_sessions_that_cannot_be_calibrated_are_refused(tmp_path: Path, world: R
         read_recordings([write_session(tmp_path / "pushing.mcap", world, name="pushing")])
     with pytest.raises(UsageError, match="no attempt with contact"):
         read_recordings([write_session(tmp_path / "free.mcap", world, contact=False)])
+    with SessionRecorder(tmp_path / "bare.mcap", ScaledClock()) as recorder:
+        recorder.metadata({"task": INSERTION.to_json(), "lab": LAB})
+    with pytest.raises(UsageError, match="has no camera mounts"):
+        read_recordings([tmp_path / "bare.mcap"])
     usual, deeper = write_session(tmp_path / "a.mcap", world), write_session(tmp_path / "b.mcap", world, descent=2e-3)
     with pytest.raises(UsageError, match="another part or task"):
         read_recordings([usual, deeper])
