@@ -84,8 +84,8 @@ def run(args: argparse.Namespace) -> int:
         )
     report = plain_report(result, args.sessions)
     try:
-        files[0].write_text(readable_json(report))
-        files[1].write_text(page(result, args.sessions, recordings.task.grid))
+        files[0].write_text(readable_json(report), "utf-8")
+        files[1].write_text(page(result, args.sessions, recordings.task.grid), "utf-8", "replace")
         scene = write_scene(result, args.out)
     except OSError as error:
         raise UsageError(f"cannot write the report to {args.out}: {error}") from error
