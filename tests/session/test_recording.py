@@ -24,7 +24,6 @@ from gelflow.geometry import Pose
 from gelflow.observation import FlowMap
 from gelflow.protocols import ArmState, CameraImage, GripperState
 from gelflow.session.channels import JSON
-from gelflow.session.messages import Damage
 from gelflow.session.reader import SessionReader
 from gelflow.session.recorder import SessionRecorder
 from gelflow.session.records import Decision, describe_session, from_plain, to_json, to_plain
@@ -367,16 +366,6 @@ def test_a_session_without_description_and_unknown_topics(tmp_path: Path) -> Non
             list(reader.records("/event"))
     with pytest.raises(UsageError, match="not open"):
         reader.counts()
-
-
-def test_records_after_the_reader_is_closed_are_no_damage(session: Path) -> None:
-    damage = Damage()
-    with SessionReader(session) as reader:
-        records = reader.records(damage=damage)
-        next(records)
-    with pytest.raises(UsageError, match="not open"):
-        list(records)
-    assert not damage
 
 
 # Plain data

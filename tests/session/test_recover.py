@@ -173,6 +173,16 @@ def test_records_that_cannot_be_decoded_are_passed_over_and_counted(tmp_path: Pa
     assert (damage.chunks, damage.records) == (0, 3)
 
 
+def test_records_after_the_reader_is_closed_are_no_damage(tmp_path: Path) -> None:
+    damage = Damage()
+    with SessionReader(make(tmp_path / "session.mcap")) as reader:
+        records = reader.records(damage=damage)
+        next(records)
+    with pytest.raises(UsageError, match="not open"):
+        list(records)
+    assert not damage
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_random_damage_raises_gelflow_errors_only(tmp_path: Path, seed: int) -> None:
     rng = np.random.default_rng(seed)
