@@ -39,8 +39,8 @@ def write_scene(result: Calibration, folder: Path) -> list[Path]:
     for name, value in changed.items():
         _set(tables, name, value)
     tables["model"] = MODEL
-    (folder / SCENE).write_text(_HEADING.format(names=", ".join(known)) + toml_text(tables))
-    (folder / MODEL).write_text(_model(shipped.with_name(MODEL), changed))
+    (folder / SCENE).write_text(_HEADING.format(names=", ".join(known)) + toml_text(tables), "utf-8")
+    (folder / MODEL).write_text(_model(shipped.with_name(MODEL), changed), "utf-8")
     return [folder / SCENE, folder / MODEL]
 
 
@@ -67,7 +67,7 @@ def _set(tables: dict[str, Any], parameter: str, value: float) -> None:
 
 def _model(shipped: Path, parameters: Mapping[str, float]) -> str:
     """The model of the scene, with the parameters of the arm's servos."""
-    root = ElementTree.fromstring(shipped.read_text())
+    root = ElementTree.fromstring(shipped.read_bytes())
     for servo in root.iterfind("actuator/position"):
         name = servo.get("name")
         if name in ARM_JOINTS and f"{name}.kp" in parameters:

@@ -100,13 +100,16 @@ class _Setup:
     @classmethod
     def of(cls, path: Path, described: dict[str, Any]) -> "_Setup":
         """The set-up in the description of a session. Raises UsageError for another task, and without a grasp."""
-        task, mounts = _task(path, described), described["mounts"]
+        task = _task(path, described)
         try:
+            mounts = described["mounts"]
             lab = described["lab"]
             force = float(lab["gripper"]["grasp_force"])
             height = float(lab["part"]["grasp_height"]) - task.part.size[2] / 2
         except (KeyError, TypeError):
-            raise UsageError(f"{path}: the session has no lab file with grasp_force and grasp_height") from None
+            raise UsageError(
+                f"{path}: the session has no camera mounts, or no lab file with grasp_force and grasp_height"
+            ) from None
         one = mounts[0]
         printed = Grid(one["rows"], one["cols"], one["pitch"], tuple(one["center"])) if "pitch" in one else None
         return cls(task, printed, mounts, force, height)

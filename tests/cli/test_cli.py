@@ -2,6 +2,7 @@
 
 import errno
 import json
+import os
 import re
 import socket
 import subprocess
@@ -148,6 +149,24 @@ def test_a_closed_pipe_ends_the_command_silently(form: list[str]) -> None:
     command.stdout.close()
     assert command.stderr.read() == b""
     assert command.wait() == 1
+
+
+@pytest.mark.parametrize(
+    "environment",
+    [{"PYTHONIOENCODING": "ascii"}, {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0"}],
+)
+def test_a_character_that_the_terminal_lacks_is_replaced(environment: dict[str, str]) -> None:
+    command = [*MAIN, "describe", "insertion", "--no-timing"]
+    done = subprocess.run(command, env=os.environ | environment, capture_output=True, text=True)
+    assert done.returncode == 0 and done.stderr == ""
+    assert "m/s?" in done.stdout
+
+
+def test_a_closed_standard_output_is_no_traceback() -> None:
+    command = subprocess.run(
+        ["sh", "-c", '"$@" >&-', "sh", *MAIN, "describe", "insertion", "--no-timing"], stderr=subprocess.PIPE
+    )
+    assert command.returncode == 0 and command.stderr == b""
 
 
 def test_an_interrupt_during_the_imports_is_no_traceback(

@@ -284,6 +284,11 @@ def test_misuse_of_the_recorder_raises_usage_errors(tmp_path: Path) -> None:
     with recorder:
         with pytest.raises(UsageError, match="sensor must be 0"):
             recorder.image(2, CameraImage(b"", 0.0, 0))
+        for sequence in (-1, 2**32):
+            with pytest.raises(UsageError, match=f"sequence number .*, got {sequence}"):
+                recorder.image(0, CameraImage(b"", 0.0, sequence))
+        with pytest.raises(UsageError, match="must be finite, got nan"):
+            recorder.image(0, CameraImage(b"", float("nan"), 0))
         with pytest.raises(UsageError, match="expected 3 numbers"):
             recorder.arm_command(0.0, [1, 2], TURN, kind="command")
         with pytest.raises(UsageError, match="'command' or 'applied'"):
@@ -357,6 +362,8 @@ def test_a_session_without_description_and_unknown_topics(tmp_path: Path) -> Non
             reader.description()
         with pytest.raises(UsageError, match="/left/image"):
             list(reader.records(["/camera"]))
+        with pytest.raises(UsageError, match=r"give \['/event'\]"):
+            list(reader.records("/event"))
     with pytest.raises(UsageError, match="not open"):
         reader.counts()
 

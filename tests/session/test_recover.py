@@ -1,6 +1,7 @@
 """Recovery of sessions whose recorder was killed or whose file is damaged."""
 
 import signal
+import struct
 import subprocess
 import sys
 from pathlib import Path
@@ -17,6 +18,7 @@ from gelflow.session.messages import Damage
 from gelflow.session.reader import SessionReader
 from gelflow.session.recorder import SessionRecorder
 from gelflow.session.recovery import recover
+from gelflow.session.time_index import TimeIndex
 
 CLOCK = ScaledClock(1.0)
 
@@ -97,6 +99,43 @@ def test_damage_in_a_finished_file_is_reported_and_the_rest_recovered(tmp_path: 
         assert len(list(reader.records())) == report.messages
 
 
+def test_damaged_channels_are_recovered_from_the_end_of_the_file(tmp_path: Path) -> None:
+    path = make(tmp_path / "session.mcap")
+    data = bytearray(path.read_bytes())
+    data[500] ^= 0xFF  # in the first chunk, which has all schemas and channels
+    path.write_bytes(data)
+    report = recover(path, tmp_path / "saved.mcap")
+    assert report.damaged_chunks == 1 and 25 < report.messages < 41
+    with SessionReader(report.path) as reader:
+        assert len(list(reader.records(["/left/image"]))) == report.messages
+
+
+@pytest.mark.parametrize("wrong", ["position", "channel"])
+def test_damage_in_the_index_costs_no_other_records(tmp_path: Path, wrong: str) -> None:
+    path = make(tmp_path / "session.mcap")
+    with SessionReader(path) as reader:
+        assert reader.summary is not None
+        chunk = reader.summary.chunk_indexes[3]
+    data = path.read_bytes()
+    channel, position = next(iter(chunk.message_index_offsets.items()))
+    entry = struct.pack("<HQ", channel, position)
+    old = struct.pack("<Q", chunk.chunk_start_offset) if wrong == "position" else entry
+    new = struct.pack("<Q", 1 << 62) if wrong == "position" else struct.pack("<HQ", 0xFFFF, position)
+    head, _, tail = data.rpartition(old)
+    path.write_bytes(head + new + tail)
+    damage = Damage()
+    with SessionReader(path) as reader:
+        images = list(reader.records(["/left/image"], damage=damage))
+        assert len(TimeIndex(reader).between("/left/image", -1e9, 1e9)) == len(images) == 40 - damage.records
+        if wrong == "channel":
+            assert not damage
+            return
+        with pytest.raises(PeerError, match="is damaged"):
+            list(reader.records())
+    assert damage.chunks == 1 and len(images) > 25
+    assert recover(path, tmp_path / "saved.mcap").messages == 41
+
+
 def test_a_reader_goes_on_past_damaged_chunks_and_counts_them(tmp_path: Path) -> None:
     path = make(tmp_path / "session.mcap")
     data = bytearray(path.read_bytes())
@@ -118,18 +157,30 @@ def test_records_that_cannot_be_decoded_are_passed_over_and_counted(tmp_path: Pa
         writer = Writer(stream)
         writer.start()
         writer.add_metadata("gelflow", {"format": "1", "version": "1"})
-        for topic, contents in [("/event", [b"{}", b"{broken", b"{}"]), ("/decision", [b'{"insertion": 0}'])]:
+        for topic, contents in [("/event", [b"{}", b"{broken", b"[1]", b"{}"]), ("/decision", [b'{"insertion": 0}'])]:
             schema = writer.register_schema(topic, "jsonschema", b"{}")
             channel = writer.register_channel(topic, "json", schema)
             for data in contents:
                 writer.add_message(channel, 5, data, 5, 0)
+        foreign = writer.register_channel("/other/timing", "", 0)
+        writer.add_message(foreign, 6, b"of another program", 6, 0)
         writer.finish()  # type: ignore[no-untyped-call]
     damage = Damage()
     with SessionReader(tmp_path / "odd.mcap") as reader:
-        assert [record.topic for record in reader.records(damage=damage)] == ["/event", "/event"]
+        assert [record.topic for record in reader.records(damage=damage)] == ["/event", "/event", "/other/timing"]
         with pytest.raises(PeerError, match="is damaged"):
             list(reader.records())
-    assert (damage.chunks, damage.records) == (0, 2)
+    assert (damage.chunks, damage.records) == (0, 3)
+
+
+def test_records_after_the_reader_is_closed_are_no_damage(tmp_path: Path) -> None:
+    damage = Damage()
+    with SessionReader(make(tmp_path / "session.mcap")) as reader:
+        records = reader.records(damage=damage)
+        next(records)
+    with pytest.raises(UsageError, match="not open"):
+        list(records)
+    assert not damage
 
 
 @pytest.mark.parametrize("seed", range(20))

@@ -109,6 +109,16 @@ def test_the_command_reports_identical_decisions(
     assert drawn is not None and drawn.min() < 100 and drawn.shape[0] > 300
 
 
+def test_a_narrow_terminal_shortens_no_number(
+    real_session: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert main(["replay", str(real_session)]) == 0
+    wide = capsys.readouterr().out
+    monkeypatch.setenv("COLUMNS", "50")
+    assert main(["replay", str(real_session)]) == 0
+    assert re.findall(r"[+-]\d+\.\d{3}", capsys.readouterr().out) == re.findall(r"[+-]\d+\.\d{3}", wide) != []
+
+
 def test_the_command_prints_json(real_session: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["replay", str(real_session), "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)
@@ -281,6 +291,9 @@ def test_the_command_rejects_wrong_input_with_one_line(
         recorder.metadata({})
     with SessionRecorder(tmp_path / "odd.mcap", CLOCK) as recorder:
         recorder.metadata(describe_session(task=INSERTION, trackers=[{}] * 2, mounts=[{"lens": 1}] * 2))
+    with SessionRecorder(tmp_path / "one.mcap", CLOCK) as recorder:
+        described = describe_session(task=INSERTION, trackers=[{}] * 2, mounts=[{}] * 2, checkpoint=None)
+        recorder.metadata({**described, "trackers": [{}]})
     mine = tmp_path / "mine.png"
     mine.write_bytes(b"mine")
     for arguments, message in [
@@ -289,6 +302,7 @@ def test_the_command_rejects_wrong_input_with_one_line(
         ([str(tmp_path / "text.mcap")], "is not an MCAP file"),
         ([str(tmp_path / "moved.mcap")], "name the file with --checkpoint"),
         ([str(tmp_path / "bare.mcap")], "lacks 'task'"),
+        ([str(tmp_path / "one.mcap")], "2 camera mounts and 1 trackers; its task has 2 sensors"),
         ([str(tmp_path / "odd.mcap")], "unknown keys ['lens']"),
         ([str(real_session), "--checkpoint", str(cut)], "checkpoint"),
         ([str(real_session), "--out", str(tmp_path / "no folder" / "a.png")], "no folder does not exist"),

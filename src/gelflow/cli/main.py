@@ -8,6 +8,7 @@ import argparse
 import contextlib
 import errno
 import importlib
+import io
 import os
 import sys
 import warnings
@@ -65,8 +66,24 @@ def _one_line(message: Warning | str, *_: object, **__: object) -> str:
     return f"gelflow: {message}\n"
 
 
+def _prepare_streams() -> None:
+    """Let no text fail to be printed.
+
+    A character that the encoding of the terminal lacks becomes "?"; text for a closed stream is discarded.
+    """
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:  # closed, as by `>&-`
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115 - until the end of the process
+        elif isinstance(stream, io.TextIOWrapper):
+            limited = not stream.encoding.lower().startswith("utf")
+            if stream.errors == "strict" or (limited and stream.errors == "surrogateescape"):
+                stream.reconfigure(errors="replace")
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one sub-command and return its exit code (see `gelflow.cli.exit_codes`)."""
+    _prepare_streams()
     arguments = list(sys.argv[1:] if argv is None else argv)
     requested = next((a for a in arguments if not a.startswith("-")), "")
     try:

@@ -6,6 +6,7 @@ from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn, TimeRemainingColumn
+from rich.table import Table
 
 from gelflow.session.records import to_plain
 
@@ -23,6 +24,13 @@ class Output:
     def text(self, line: str) -> None:
         """Print one line without markup or line breaks."""
         self.console.print(line, markup=False, soft_wrap=True)
+
+    def wide_table(self, table: Table) -> None:
+        """Print a table of numbers; a narrower terminal breaks its lines, and no number is shortened."""
+        needed = self.console.measure(table, options=self.console.options.update(max_width=1000)).maximum
+        if needed > self.console.width:
+            table.width = needed
+        self.console.print(table, crop=False)
 
     def result(self, values: Mapping[str, Any]) -> None:
         """The result of the command. Printed with `--json` only; NaN and the infinities become strings."""

@@ -48,7 +48,15 @@ def _recorded_perception(description: Mapping[str, Any]) -> tuple[InsertionTask,
         mounts = [from_plain(CameraMount, mount, what="camera mount") for mount in description["mounts"]]
         configs = [from_plain(TrackerConfig, config, what="tracker settings") for config in description["trackers"]]
     except KeyError as error:
-        raise PeerError(f"the session's description lacks {error}; record it with describe_session") from error
+        raise PeerError(
+            f"the session's description lacks {error}: it is not that of a run; a recording of gelflow track, for "
+            "example, has no decisions. Record your own with describe_session"
+        ) from error
+    if not len(mounts) == len(configs) == task.sensors:
+        raise PeerError(
+            f"the session describes {len(mounts)} camera mounts and {len(configs)} trackers; its task has "
+            f"{task.sensors} sensors"
+        )
 
     class Tracker:
         """The marker tracker on compressed images."""

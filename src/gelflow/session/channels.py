@@ -15,6 +15,8 @@ from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from mcap.writer import Writer
+from mcap_protobuf.schema import build_file_descriptor_set
 
 from gelflow.session.records import SENSORS
 
@@ -169,3 +171,19 @@ JSON: dict[str, JsonChannel] = {
     ),
     "/event": JsonChannel("gelflow.Event", {"stamp": NUMBER, "name": TEXT, "values": TABLE}, ("name", "values")),
 }
+
+
+def register_channels(writer: Writer) -> dict[str, int]:
+    """Register all schemas and channels of a session; returns the channel number of each topic."""
+    channels = {}
+    schemas: dict[str, int] = {}
+    for topic, kind in PROTOBUF.items():
+        name = kind.DESCRIPTOR.full_name
+        if name not in schemas:
+            description = build_file_descriptor_set(kind).SerializeToString()
+            schemas[name] = writer.register_schema(name, "protobuf", description)
+        channels[topic] = writer.register_channel(topic, "protobuf", schemas[name])
+    for topic, channel in JSON.items():
+        schema = writer.register_schema(channel.name, "jsonschema", channel.schema())
+        channels[topic] = writer.register_channel(topic, "json", schema)
+    return channels

@@ -14,7 +14,7 @@ from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
 
 from gelflow.errors import PeerError, UsageError
-from gelflow.session.messages import DECODE_ERRORS
+from gelflow.session.messages import READ_ERRORS
 from gelflow.session.reader import SessionReader, open_recording
 
 _HEAD = struct.Struct("<BQ")  # opcode and length of a record
@@ -44,7 +44,10 @@ class LiveReader(SessionReader):
         return self._found
 
     def update(self) -> list[ChunkIndex]:
-        """Find the chunks that were written since the last call. Raises UsageError for a newer format."""
+        """Find the chunks that were written since the last call.
+
+        Raises UsageError for a newer format, and PeerError when the file is damaged outside its chunks.
+        """
         if self._stream is None:
             raise UsageError(f"{self.path}: the reader is not open")
         before = len(self._found.chunk_indexes)
@@ -54,7 +57,12 @@ class LiveReader(SessionReader):
             opcode, length = _HEAD.unpack(os.pread(number, _HEAD.size, self._position))
             if self._position + _HEAD.size + length > size:
                 break  # the recorder is writing it
-            self._take(opcode, os.pread(number, length, self._position + _HEAD.size))
+            try:
+                self._take(opcode, os.pread(number, length, self._position + _HEAD.size))
+            except UsageError:
+                raise
+            except READ_ERRORS as error:
+                raise self._damaged(error) from error
             self._position += _HEAD.size + length
         return self._found.chunk_indexes[before:]
 
@@ -80,7 +88,7 @@ class LiveReader(SessionReader):
         try:
             chunk = Chunk.read(ReadDataStream(BytesIO(data)))
             records = breakup_chunk(chunk, validate_crc=True)
-        except DECODE_ERRORS:
+        except READ_ERRORS:
             return
         for record in records:
             if isinstance(record, Schema):

@@ -31,6 +31,8 @@ DECODE_ERRORS = (
     MemoryError,
     OverflowError,
 )
+# The same, and those of an invalid position in the file or a faulty disk.
+READ_ERRORS = (*DECODE_ERRORS, OSError)
 _RECORD_HEAD = 9  # opcode and length of a record [bytes]
 
 
@@ -50,7 +52,7 @@ def ordered_messages(
 ) -> Iterator[tuple[Channel, Message]]:
     """Messages of `topics` (None: all) in the order of their log times.
 
-    A damaged chunk is counted in `damage`; without `damage` it raises one of `DECODE_ERRORS`.
+    A damaged chunk is counted in `damage`; without `damage` it raises one of `READ_ERRORS`.
     """
     chunks = [chunk for chunk in summary.chunk_indexes if has_topic(chunk, summary, topics)]
     chunks.sort(key=lambda chunk: (chunk.message_start_time, chunk.chunk_start_offset))
@@ -59,7 +61,7 @@ def ordered_messages(
     for chunk, following in itertools.zip_longest(chunks, chunks[1:]):
         try:
             found = chunk_messages(stream, chunk, summary)
-        except DECODE_ERRORS:
+        except READ_ERRORS:
             if damage is None:
                 raise
             damage.chunks += 1
@@ -82,12 +84,19 @@ def expected_records(summary: Summary, topics: Collection[str] | None) -> int:
 
 def has_topic(chunk: ChunkIndex, summary: Summary, topics: Collection[str] | None) -> bool:
     """Whether a chunk contains messages of `topics`, or its index does not show it."""
+    return topics is None or any(topic in topics for topic in chunk_topics(chunk, summary))
+
+
+def chunk_topics(chunk: ChunkIndex, summary: Summary) -> list[str]:
+    """The topics of a chunk; all of the file where the index of the chunk is missing or damaged."""
     channels = chunk.message_index_offsets
-    return topics is None or not channels or any(summary.channels[key].topic in topics for key in channels)
+    if not channels or not channels.keys() <= summary.channels.keys():
+        return list(dict.fromkeys(channel.topic for channel in summary.channels.values()))
+    return list(dict.fromkeys(summary.channels[key].topic for key in channels))
 
 
 def chunk_messages(stream: BinaryIO, index: ChunkIndex, summary: Summary) -> list[tuple[Channel, Message]]:
-    """All messages of a chunk. Raises one of `DECODE_ERRORS` when it is damaged."""
+    """All messages of a chunk. Raises one of `READ_ERRORS` when it is damaged."""
     stream.seek(index.chunk_start_offset + _RECORD_HEAD)
     data = stream.read(index.chunk_length - _RECORD_HEAD)
     records = breakup_chunk(Chunk.read(ReadDataStream(BytesIO(data))), validate_crc=True)

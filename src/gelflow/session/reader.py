@@ -21,7 +21,7 @@ from gelflow.errors import PeerError, UsageError
 from gelflow.geometry import Pose
 from gelflow.protocols import CameraImage
 from gelflow.session.channels import JSON, PROTOBUF
-from gelflow.session.messages import DECODE_ERRORS, Damage, chunk_messages, expected_records, ordered_messages
+from gelflow.session.messages import READ_ERRORS, Damage, chunk_messages, expected_records, ordered_messages
 from gelflow.session.records import FORMAT, SENSORS, Decision
 
 
@@ -63,7 +63,7 @@ class SessionReader:
                 raise PeerError(self._unfinished(stream))
             self._reader = SeekingReader(stream, validate_crcs=True)
             self._check_format(self._reader)
-        except DECODE_ERRORS as error:
+        except READ_ERRORS as error:
             stream.close()
             if isinstance(error, UsageError):
                 raise
@@ -102,9 +102,11 @@ class SessionReader:
     def records(self, topics: Collection[str] | None = None, *, damage: Damage | None = None) -> Iterator[Record]:
         """All records, or those of `topics`, in the order of recording.
 
-        Raises UsageError for an unknown topic, and PeerError where the file is damaged. With `damage`, the reader
-        continues after damaged records and adds their number to it.
+        Raises UsageError for an unknown topic and when the reader is closed, and PeerError where the file is damaged.
+        With `damage`, the reader continues after damaged records and adds their number to it.
         """
+        if isinstance(topics, str):
+            raise UsageError(f"topics must be a list, got a text; give [{topics!r}]")
         if topics is not None and (unknown := set(topics) - set(PROTOBUF) - set(JSON)):
             known = ", ".join([*PROTOBUF, *JSON])
             raise UsageError(f"no such topic: {', '.join(sorted(unknown))}; the topics of a session are {known}")
@@ -113,19 +115,22 @@ class SessionReader:
             return  # the recorder has written no message
         read = _with_timing(topics)
         assert self._stream is not None
-        messages = ordered_messages(self._stream, summary, read, damage)
+        stream = self._stream
+        messages = ordered_messages(stream, summary, read, damage)
         camera_times: dict[str, tuple[int, float]] = {}  # per sensor, of the image that follows
         good = 0
         while True:
+            if stream.closed:  # since the last record
+                raise UsageError(f"{self.path}: the reader is not open")
             try:
                 channel, message = next(messages)
             except StopIteration:
                 break
-            except DECODE_ERRORS as error:
+            except READ_ERRORS as error:
                 raise self._damaged(error) from error
             try:
                 record = self._record(channel.topic, message, camera_times)
-            except (*DECODE_ERRORS, PeerError) as error:
+            except (*READ_ERRORS, PeerError) as error:
                 if damage is None:
                     raise self._damaged(error) from error
                 continue
@@ -153,14 +158,14 @@ class SessionReader:
             with self._reading:
                 found = chunk_messages(self._stream, index, summary)
             return [(channel.topic, message) for channel, message in found]
-        except DECODE_ERRORS as error:
+        except READ_ERRORS as error:
             raise self._damaged(error) from error
 
     def record(self, topic: str, message: Message) -> Record:
         """A message as a record, without the time of the camera's own clock. Raises PeerError when it is damaged."""
         try:
             return self._record(topic, message, {})
-        except DECODE_ERRORS as error:
+        except READ_ERRORS as error:
             raise self._damaged(error) from error
 
     def robot_time(self, nanoseconds: int) -> float:
@@ -172,7 +177,7 @@ class SessionReader:
         stamp = self.robot_time(message.publish_time)
         value = _decode(topic, message, stamp)
         sensor = topic.removeprefix("/").partition("/")[0]
-        if topic == f"/{sensor}/timing":
+        if sensor in SENSORS and topic == f"/{sensor}/timing":
             camera_times[sensor] = value["sequence"], float(value["camera_time"])
         elif isinstance(value, CameraImage) and sensor in camera_times:
             sequence, camera_time = camera_times.pop(sensor)
@@ -254,7 +259,10 @@ def _decode(topic: str, message: Message, stamp: float) -> Any:
     if topic == "/decision":
         return Decision.from_json(json.loads(message.data))
     if topic in JSON:
-        return json.loads(message.data)
+        value = json.loads(message.data)
+        if not isinstance(value, dict):
+            raise ValueError(f"the record of {topic} is no JSON object")
+        return value
     if topic not in PROTOBUF:
         return message.data
     decoded = PROTOBUF[topic].FromString(message.data)

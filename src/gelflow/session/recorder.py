@@ -2,6 +2,7 @@
 
 import contextlib
 import fcntl
+import math
 import os
 import queue
 import threading
@@ -18,7 +19,6 @@ from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from mcap.writer import Writer
-from mcap_protobuf.schema import build_file_descriptor_set
 from numpy.typing import ArrayLike
 
 from gelflow import __version__, interrupts
@@ -26,7 +26,7 @@ from gelflow.clock import Clock
 from gelflow.errors import GelflowError, PeerError, PeerTimeout, UsageError
 from gelflow.protocols import ArmState, CameraImage, GripperState
 from gelflow.session.annotations import annotate
-from gelflow.session.channels import BASE_FRAME, JSON, PROTOBUF, TOOL_FRAME
+from gelflow.session.channels import BASE_FRAME, TOOL_FRAME, register_channels
 from gelflow.session.records import FORMAT, SENSORS, Decision, to_json, to_plain
 from gelflow.session.viewer_messages import event_log, flow_image
 
@@ -41,7 +41,9 @@ _Queued = tuple[float, _Item | threading.Event]  # time at which it was queued [
 
 
 def nanoseconds(seconds: float) -> int:
-    """A time [s] in integer nanoseconds."""
+    """A time [s] in integer nanoseconds. Raises UsageError when it is not finite."""
+    if not math.isfinite(seconds):
+        raise UsageError(f"a time of a record must be finite, got {seconds}")
     return round(float(seconds) * 1e9)
 
 
@@ -108,6 +110,8 @@ class SessionRecorder:
     def image(self, sensor: int, image: CameraImage) -> None:
         """Record a camera image as received. `sensor` 0 is the left finger."""
         name = _name(sensor)
+        if not 0 <= image.sequence < 1 << 32:  # an unsigned integer of 32 bits in the file
+            raise UsageError(f"the sequence number of an image must be within 0 to 2**32 - 1, got {image.sequence}")
         if image.camera_time is not None:  # before the image: the reader joins both
             timing = {"stamp": image.stamp, "sequence": image.sequence, "camera_time": image.camera_time}
             self._json(f"/{name}/timing", timing, stamp=image.stamp)
@@ -291,7 +295,7 @@ class SessionRecorder:
         writer.start(profile="", library=f"gelflow {__version__}")
         first = {"format": str(FORMAT), "version": __version__, "epoch_ns": str(self._epoch)}
         writer.add_metadata("gelflow", first)
-        channels = _register(writer)
+        channels = register_channels(writer)
         writer.flush()  # type: ignore[no-untyped-call]
         with _Syncer(stream.fileno(), self._fail, self._syncing) as syncer:
             finished = self._write_queue(writer, channels, syncer)
@@ -382,18 +386,3 @@ def _fill(message: Any, names: str, values: ArrayLike) -> None:
         raise UsageError(f"expected {len(names)} numbers ({' '.join(names)}), got shape {numbers.shape}")
     for name, number in zip(names, numbers, strict=True):
         setattr(message, name, float(number))
-
-
-def _register(writer: Writer) -> dict[str, int]:
-    channels = {}
-    schemas: dict[str, int] = {}
-    for topic, kind in PROTOBUF.items():
-        name = kind.DESCRIPTOR.full_name
-        if name not in schemas:
-            description = build_file_descriptor_set(kind).SerializeToString()
-            schemas[name] = writer.register_schema(name, "protobuf", description)
-        channels[topic] = writer.register_channel(topic, "protobuf", schemas[name])
-    for topic, channel in JSON.items():
-        schema = writer.register_schema(channel.name, "jsonschema", channel.schema())
-        channels[topic] = writer.register_channel(topic, "json", schema)
-    return channels

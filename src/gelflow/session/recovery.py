@@ -11,14 +11,15 @@ from typing import BinaryIO
 
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
+from mcap.reader import SeekingReader
 from mcap.records import Channel, Chunk, McapRecord, Message, Metadata, Schema
 from mcap.stream_reader import breakup_chunk
 from mcap.writer import MCAP0_MAGIC, Writer
 
 from gelflow import __version__
 from gelflow.errors import PeerError, UsageError
-from gelflow.session.messages import DECODE_ERRORS
-from gelflow.session.reader import SessionReader, is_being_recorded, open_recording
+from gelflow.session.messages import DECODE_ERRORS, READ_ERRORS
+from gelflow.session.reader import SessionReader, is_being_recorded, is_finished, open_recording
 from gelflow.session.recorder import CHUNK_BYTES
 
 
@@ -50,6 +51,7 @@ def recover(source: str | Path, target: str | Path) -> RecoveryReport:
         try:
             with partial.open("wb") as out:
                 copy = _Copy(out)
+                copy.take_summary(stream)
                 for opcode, data in _complete_records(stream, copy):
                     copy.take(opcode, data)
                 copy.finish(source)
@@ -86,6 +88,15 @@ class _Copy:
         self._channels: dict[int, int] = {}
         self.messages = self.damaged = self.lost = 0
         self.first = self.last = 0
+
+    def take_summary(self, stream: BinaryIO) -> None:
+        """Copy the schemas and channels at the end of a finished file: those in its first chunk may be damaged."""
+        if not is_finished(stream):
+            return
+        with contextlib.suppress(*READ_ERRORS):
+            summary = SeekingReader(stream, validate_crcs=True).get_summary()
+            for record in [] if summary is None else [*summary.schemas.values(), *summary.channels.values()]:
+                self._put(record)
 
     def take(self, opcode: int, data: bytes) -> None:
         """Copy one top-level record; an unreadable one is counted as damaged."""

@@ -9,6 +9,7 @@ import numpy as np
 from mcap.records import ChunkIndex, Message
 
 from gelflow.errors import PeerError
+from gelflow.session.messages import chunk_topics
 from gelflow.session.reader import Record, SessionReader
 
 CACHED_CHUNKS = 64  # of about 64 KB
@@ -27,7 +28,7 @@ class TimeIndex:
         summary = session.summary
         if summary is None or not summary.chunk_indexes:
             raise PeerError(f"{session.path} contains no records: there is nothing to show")
-        self._session, self._channels = session, summary.channels
+        self._session, self._summary = session, summary
         self._lock = threading.Lock()
         self._cache: OrderedDict[int, Messages] = OrderedDict()
         self._damaged: set[int] = set()
@@ -57,9 +58,8 @@ class TimeIndex:
             self._starts.append(max(start, self._starts[-1]) if self._starts else start)
             self._ends.append(max(end, self._ends[-1]) if self._ends else end)
             self._chunks.append(chunk)
-            # A chunk without an index may contain every topic.
-            for channel in chunk.message_index_offsets or self._channels:
-                self._topics.setdefault(self._channels[channel].topic, []).append(number)
+            for topic in chunk_topics(chunk, self._summary):
+                self._topics.setdefault(topic, []).append(number)
 
     @property
     def damaged(self) -> int:

@@ -1,9 +1,11 @@
 """Calibration from recorded sessions: which are read and refused, `gelflow calibrate`, `gelflow replay --simulate`."""
 
 import dataclasses
+import io
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,10 +15,12 @@ from gelflow.cli.main import main
 from gelflow.clock import ScaledClock
 from gelflow.errors import UsageError
 from gelflow.perception.frames import CameraMount
+from gelflow.policies.calibration.calibrated_scene import write_scene
 from gelflow.policies.calibration.experiment.worlds import RecordedWorld
 from gelflow.policies.calibration.session_recordings import read_recordings
 from gelflow.session import SessionRecorder
 from gelflow.session.records import Decision, describe_session
+from gelflow.sim.scene import load_scene
 from gelflow.task import INSERTION
 
 LAB = {"gripper": {"grasp_force": 12.0}, "part": {"grasp_height": 0.03}}
@@ -127,6 +131,10 @@ def test_sessions_that_cannot_be_calibrated_are_refused(tmp_path: Path, world: R
         read_recordings([write_session(tmp_path / "pushing.mcap", world, name="pushing")])
     with pytest.raises(UsageError, match="no attempt with contact"):
         read_recordings([write_session(tmp_path / "free.mcap", world, contact=False)])
+    with SessionRecorder(tmp_path / "bare.mcap", ScaledClock()) as recorder:
+        recorder.metadata({"task": INSERTION.to_json(), "lab": LAB})
+    with pytest.raises(UsageError, match="has no camera mounts"):
+        read_recordings([tmp_path / "bare.mcap"])
     usual, deeper = write_session(tmp_path / "a.mcap", world), write_session(tmp_path / "b.mcap", world, descent=2e-3)
     with pytest.raises(UsageError, match="another part or task"):
         read_recordings([usual, deeper])
@@ -175,6 +183,16 @@ def test_a_folder_that_cannot_be_written_to_is_refused_before_the_fit(
         assert f"cannot write into {file}" in capsys.readouterr().err
     assert main(["calibrate", str(session), "--plan", str(tmp_path / "plan.toml"), "--lab", "missing.toml"]) == 2
     assert "missing.toml" in capsys.readouterr().err
+
+
+def test_the_scene_does_not_depend_on_the_encoding_of_the_locale(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    known = SimpleNamespace(parameter=SimpleNamespace(name="arm_stiffness"), value=2e3, verdict="known")
+    monkeypatch.setattr(io, "text_encoding", lambda encoding, _=2: encoding or "ascii")  # the default of the locale
+    result: Any = SimpleNamespace(estimates=[known])
+    scene, model = write_scene(result, tmp_path)
+    assert load_scene(scene).name and model.exists()
 
 
 @pytest.mark.slow

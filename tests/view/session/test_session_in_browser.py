@@ -120,6 +120,7 @@ def test_wrong_arguments_end_with_one_line(
     paths: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     first = str(paths[0])
+    (tmp_path / "BAD.MCAP").write_bytes(paths[0].read_bytes()[:-100])
     (tmp_path / "bad.mcap").write_bytes(paths[0].read_bytes()[:-100])
     for arguments, expected in (
         ([first, "rolling"], "one session or two"),
@@ -130,6 +131,7 @@ def test_wrong_arguments_end_with_one_line(
         ([first, "--checkpoint", "a"], "add --replay"),
         ([str(tmp_path / "none.mcap")], "cannot open"),
         ([str(tmp_path / "bad.mcap")], "gelflow recover"),
+        ([str(tmp_path / "BAD.MCAP")], "gelflow recover"),
         ([first, "--replay"], "names no checkpoint"),
     ):
         assert main(["view", *arguments, "--port", "0"]) == 2, arguments

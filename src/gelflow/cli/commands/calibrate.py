@@ -84,8 +84,8 @@ def run(args: argparse.Namespace) -> int:
         )
     report = plain_report(result, args.sessions)
     try:
-        files[0].write_text(readable_json(report))
-        files[1].write_text(page(result, args.sessions, recordings.task.grid))
+        files[0].write_text(readable_json(report), "utf-8")
+        files[1].write_text(page(result, args.sessions, recordings.task.grid), "utf-8", "replace")
         scene = write_scene(result, args.out)
     except OSError as error:
         raise UsageError(f"cannot write the report to {args.out}: {error}") from error
@@ -171,6 +171,7 @@ def _show(output: Output, result: Calibration) -> None:
 
 def _table(result: Calibration) -> Table:
     table = Table("parameter", "value", "95 % interval", "unit", "from the recordings")
+    table.columns[0].no_wrap = True
     for column in table.columns[1:3]:
         column.justify = "right"
     for estimate in result.estimates:

@@ -169,7 +169,7 @@ def _show(output: Output, result: _Result, picture: Path | None) -> int:
         for comparison in result.comparisons
     ]
     if not output.json and decisions:
-        output.console.print(_table(result.comparisons))
+        output.wide_table(_table(result.comparisons))
     if picture:
         output.text(f"picture: {picture}")
     for line in (*_latency_lines(result.latencies), *result.verdict()):

@@ -38,7 +38,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Serve the page until Ctrl-C."""
-    sessions = [name for name in args.shown if name.endswith(".mcap")]
+    sessions = [name for name in args.shown if name.lower().endswith(".mcap")]
     if sessions and (len(sessions) < len(args.shown) or len(sessions) > 2):
         raise UsageError(f"name one scene, or one session or two, got {' '.join(args.shown)}")
     if not sessions and len(args.shown) > 1:
