@@ -23,6 +23,9 @@ from gelflow.perception.dot_windows import (
     sample,
 )
 
+# A dot is damaged if the ink of a pixel differs from the profile by this much [contrast]: ink is missing, or is where
+# none should be. Smaller differences on real prints belong to the dot.
+_DAMAGED = 0.7
 # A pixel is damaged if it differs from the profile by more than this multiple of the median, over the dots, of their
 # largest differences, within these limits [contrast], plus what a deviation of the outline explains there.
 _UNUSUAL = 1.25
@@ -63,7 +66,7 @@ def find_damaged(windows: DotWindows, rest: Floats, shape: Floats, profile: Pixe
     common = windows.common[markers]
     own = (shape[markers] != common).any(axis=1)
     size, raggedness = (float(np.median(one[own])) if own.any() else 0.0 for one in deviations(shape[markers], common))
-    fit = _IntactPartFit(windows, np.flatnonzero(~own | (largest > limit)), limit, size, raggedness)
+    fit = _IntactPartFit(windows, np.flatnonzero(largest > _DAMAGED), limit, size, raggedness)
     return fit.run(rest, shape, profile)
 
 
