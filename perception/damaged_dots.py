@@ -13,6 +13,7 @@ from scipy.ndimage import maximum_filter
 
 from gelflow.perception._tracker import MASK_CELLS, MASK_REACH
 from gelflow.perception.dot_windows import (
+    MAX_CHANGE,
     DotPixels,
     DotWindows,
     Floats,
@@ -34,7 +35,6 @@ _ROUNDS = 5  # of the alternating estimation of outline and intact part
 _SIZE_ROUNDS = 2  # the first ones, in which the outline changes in size only
 _DEVIATION = (4.0, 1.5)  # of the outline, relative to the median one, in the first rounds and in the others
 _STEPS = 2  # Gauss-Newton steps in a round
-_MAX_CHANGE = 0.2  # of size, ellipse and waves in a step
 _HALF_WEIGHT = 0.16  # residual / contrast at which a pixel has half the weight
 _RESIDUAL = 0.12  # standard deviation of the residuals / contrast, for the weight of the prior
 _MIN_SPREAD = 0.005  # smallest standard deviation of the prior [radii]
@@ -53,21 +53,22 @@ class DamagedDots:
     masks: Pixels
 
 
-def find_damaged(windows: DotWindows, rest: Floats, shape: Floats, profile: Pixels) -> DamagedDots:
-    """The damaged dots among those of `windows`. `rest`, `shape` and `profile` as in `DotModel`.
+def find_damaged(windows: DotWindows, rest: Floats, shape: Floats, profile: Pixels) -> DamagedDots | None:
+    """The damaged dots among those of `windows`, None without any. `rest`, `shape` and `profile` as in `DotModel`.
 
     Dots whose own outline could not be estimated have the common shape.
     """
-    markers = windows.markers
-    radius = DotPixels.at(*windows.offsets(rest, markers), shape[markers]).radius
-    ink = windows.ink_at(radius, np.ones(len(markers), dtype=bool))[0]
-    largest = (np.abs(ink - sample(profile, radius)[0]) * (radius < 1.6)).max(axis=1)
+    residual, radius = windows.residuals(rest, shape, profile)
+    largest = (np.abs(residual) * (radius < 1.6)).max(axis=1)
+    dots = np.flatnonzero(largest > _DAMAGED)
+    if not dots.size:
+        return None
     limit = float(np.clip(_UNUSUAL * np.median(largest), *_UNUSUAL_LIMITS))
-    common = windows.common[markers]
-    own = (shape[markers] != common).any(axis=1)
-    size, raggedness = (float(np.median(one[own])) if own.any() else 0.0 for one in deviations(shape[markers], common))
-    fit = _IntactPartFit(windows, np.flatnonzero(largest > _DAMAGED), limit, size, raggedness)
-    return fit.run(rest, shape, profile)
+    own, markers = windows.have_own_shape(shape), windows.markers
+    both = deviations(shape[markers], windows.common[markers])
+    size, raggedness = (float(np.median(one[own])) if own.any() else 0.0 for one in both)
+    found = _IntactPartFit(windows, dots, limit, size, raggedness).run(rest, shape, profile)
+    return found if found.markers.size else None
 
 
 class _IntactPartFit:
@@ -107,9 +108,7 @@ class _IntactPartFit:
         return DamagedDots(self._markers[use], centre[use], outline[use], self._masks(centre, outline, intact)[use])
 
     def _at(self, centre: Floats, outline: Floats) -> DotPixels:
-        moved = (centre - self._windows.centre_pixel[self._markers]).astype(np.float32)
-        step = self._windows.step
-        return DotPixels.at(step[0] - moved[:, :1], step[1] - moved[:, 1:], outline)
+        return DotPixels.at(*self._windows.offsets(centre, self._markers), outline)
 
     def _ink(self, radius: Pixels, intact: Pixels) -> Pixels:
         """Ink relative to a background without damaged pixels, shape (dots, pixels)."""
@@ -134,7 +133,7 @@ class _IntactPartFit:
         weighted = terms * weight[:, None]
         matrix = (weighted @ terms.transpose(0, 2, 1)).astype(np.float64) + np.diag(precision + 1e-5)
         gradient = (weighted @ residual[..., None])[..., 0] - precision * change
-        return np.clip(np.linalg.solve(matrix, gradient[..., None])[..., 0], -_MAX_CHANGE, _MAX_CHANGE)
+        return np.clip(np.linalg.solve(matrix, gradient[..., None])[..., 0], -MAX_CHANGE, MAX_CHANGE)
 
     def _intact(self, ink: Pixels, radius: Pixels, profile: Pixels, deviation: float) -> Pixels:
         """Weight 1 for each intact pixel, 0 for damaged ones and their neighbours, shape (dots, pixels)."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from gelflow.perception._tracker import MASK_CELLS, PROFILE_STEPS, Tracker
 from gelflow.perception.damaged_dots import find_damaged
-from gelflow.perception.dot_windows import PROFILE_REACH, DotPixels, DotWindows, Floats, initial_profile, sample
+from gelflow.perception.dot_windows import PROFILE_REACH, DotWindows, Floats, initial_profile
 from gelflow.perception.errors import TrackerInitError, draw_detections
 from gelflow.perception.grid_detection.detect import PLANES, image_plane
 from gelflow.perception.grid_detection.grid import MarkerGrid
@@ -93,7 +93,7 @@ def _fit(image: NDArray[np.uint8], grid: MarkerGrid) -> tuple[Tracker, DotModel]
 def _with_masks(image: NDArray[np.uint8], grid: MarkerGrid, windows: DotWindows, model: DotModel) -> DotModel:
     """The model with the masks of damaged dots, except those whose intact part does not determine the centre."""
     damaged = find_damaged(windows, model.rest, model.shape, model.profile)
-    if not damaged.markers.size:
+    if damaged is None:
         return model
     rest, shape, mask_of = model.rest.copy(), model.shape.copy(), model.mask_of.copy()
     rest[damaged.markers], shape[damaged.markers] = damaged.rest, damaged.shape
@@ -114,14 +114,11 @@ def _tolerated(windows: DotWindows, model: DotModel) -> Floats:
 
     Dots with a mask, or without an outline of their own, get the smallest value: damaged pixels must be without weight.
     """
-    shape = model.shape[windows.markers]
-    radius = DotPixels.at(*windows.offsets(model.rest, windows.markers), shape).radius
-    ink, _ = windows.ink_at(radius, np.ones(len(windows.markers), dtype=bool))
-    residual = ink - sample(model.profile, radius)[0]
+    residual, radius = windows.residuals(model.rest, model.shape, model.profile)
     inside = radius < 1.5
     variance = (residual**2 * inside).sum(1) / inside.sum(1) - (model.noise / model.contrast[windows.markers]) ** 2
     variance -= _USUAL**2
-    intact = (shape != windows.common[windows.markers]).any(axis=1) & (model.mask_of[windows.markers] < 0)
+    intact = windows.have_own_shape(model.shape) & (model.mask_of[windows.markers] < 0)
     result = np.full(len(model.rest), _TOLERATED[0])
     unexplained = np.sqrt(np.maximum(variance, 0.0)) * intact
     result[windows.markers] = np.clip(_TOLERATED[0] + _UNEXPLAINED * unexplained, *_TOLERATED)

@@ -15,7 +15,7 @@ Pixels = NDArray[np.float32]  # windows around the dots: single precision takes 
 PROFILE_REACH = 2.2  # the profile ends at this many radii
 _SHAPE_STEPS = 2  # of the fit of the shapes
 _WAVE_LIMIT = 0.25  # smallest |z|² of a wave, as in csrc/dot_fit.hpp
-_MAX_CHANGE = 0.2  # of size, ellipse and waves in a step
+MAX_CHANGE = 0.2  # of size, ellipse and waves in a step
 # The outline of an intact dot differs from that of the median dot by less than this [radii], or a multiple of the
 # median difference. Others are damaged, or joined to another one.
 _INTACT = 0.04
@@ -37,7 +37,7 @@ class DotWindows:
         self.step = np.stack([right, down]).astype(np.float32)  # shape (2, pixels)
         at = np.clip(self.centre_pixel[self.markers], 0, (plane.shape[1] - 1, plane.shape[0] - 1))
         self.pixels = padded[at[:, 1, None] + half + down, at[:, 0, None] + half + right].astype(np.float32)
-        self.offset = self.offsets(grid.positions.reshape(-1, 2), self.markers)
+        self.offset = self.offsets(grid.positions.reshape(-1, 2)[self.markers], self.markers)
         distance = _length(*self.offset)
         self.background = fit_planes(self.pixels, self.step, (distance > 1.6 * grid.radius).astype(np.float32))
         ratio = self.pixels / np.maximum(self.background, 1.0) - 1
@@ -67,7 +67,7 @@ class DotWindows:
         """The shapes with size, stretch and waves of each dot by least squares; the median size is kept."""
         markers = self.markers
         refined = shape[markers]
-        right, down = self.offsets(rest, markers)
+        right, down = self.offsets(rest[markers], markers)
         ink = self.ink_at(DotPixels.at(right, down, shape[markers]).radius, np.ones(len(markers), dtype=bool))[0]
         ink, right, down = (np.take(values, self.inner, axis=1) for values in (ink, right, down))
         for _ in range(_SHAPE_STEPS):
@@ -75,7 +75,7 @@ class DotWindows:
             here, slope = sample(profile, pixels.radius)
             change = least_squares(pixels.outline_changes() * slope, ink - here)
             change[:, 0] -= np.median(change[:, 0])
-            change = np.clip(change, -_MAX_CHANGE, _MAX_CHANGE)
+            change = np.clip(change, -MAX_CHANGE, MAX_CHANGE)
             moved = np.linalg.solve(refined[:, :4].reshape(-1, 2, 2), change[:, 1:3, None]).astype(np.float32)
             right -= moved[:, 0]
             down -= moved[:, 1]
@@ -86,10 +86,23 @@ class DotWindows:
         result[markers[intact]] = refined[intact]
         return result
 
-    def offsets(self, rest: Floats, markers: NDArray[np.intp]) -> tuple[Pixels, Pixels]:
-        """Offsets of the pixels from the centres `rest` of all markers: right and down [px], shape (dots, pixels)."""
-        centre = (rest - self.centre_pixel)[markers].astype(np.float32)
-        return self.step[0] - centre[:, :1], self.step[1] - centre[:, 1:]
+    def offsets(self, centre: Floats, markers: NDArray[np.intp]) -> tuple[Pixels, Pixels]:
+        """Offsets of the pixels of `markers` (dots,) from their centres (dots, 2): right, down [px], (dots, pixels)."""
+        moved = (centre - self.centre_pixel[markers]).astype(np.float32)
+        return self.step[0] - moved[:, :1], self.step[1] - moved[:, 1:]
+
+    def residuals(self, rest: Floats, shape: Floats, profile: Pixels) -> tuple[Pixels, Pixels]:
+        """Ink of each pixel less the profile, and its distance from the centre [radii], shape (dots, pixels).
+
+        Arguments as in `DotModel`.
+        """
+        radius = DotPixels.at(*self.offsets(rest[self.markers], self.markers), shape[self.markers]).radius
+        ink, _ = self.ink_at(radius, np.ones(len(self.markers), dtype=bool))
+        return ink - sample(profile, radius)[0], radius
+
+    def have_own_shape(self, shape: Floats) -> NDArray[np.bool_]:
+        """Which dots have an outline of their own in `shape`, as in `DotModel`, instead of the common one, (dots,)."""
+        return np.asarray((shape[self.markers] != self.common[self.markers]).any(axis=1))
 
     def ink_at(self, radius: Pixels, use: NDArray[np.bool_]) -> tuple[Pixels, Pixels]:
         """Ink at the distances `radius` from the centres, and value over background less 1, shape (dots, pixels)."""
@@ -102,7 +115,8 @@ class DotWindows:
     def profile(self, rest: Floats, shape: Floats, visible: NDArray[np.bool_]) -> tuple[NDArray[np.float32], float]:
         """The mean profile, as in `DotModel`, and the pixel noise outside the dots."""
         use = visible[self.markers]
-        radius = DotPixels.at(*self.offsets(rest, self.markers[use]), shape[self.markers[use]]).radius
+        markers = self.markers[use]
+        radius = DotPixels.at(*self.offsets(rest[markers], markers), shape[markers]).radius
         ink, ratio = self.ink_at(radius, use)
         ring = np.minimum(radius / PROFILE_REACH * _RINGS, _RINGS).astype(np.intp)
         intact = np.abs(ink - initial_profile(radius)) < 0.75  # excludes damaged parts of dots

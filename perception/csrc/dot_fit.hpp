@@ -212,8 +212,10 @@ GELFLOW_CLONES inline bool inverse_hessian(const DotProfile& profile, const DotS
       const ProfileSample dot = sample_profile(profile, shape, x, y);
       const FloatPack ink = 1 + a * dot.s;
       std::array<FloatPack, 6> j = {a * dot.gx, a * dot.gy, dot.s, ink, ink * x, ink * y};
-      if (mask)
-        for (FloatPack& term : j) term *= sample_mask(*mask, dot.x, dot.y);
+      if (mask) {
+        const FloatPack described = sample_mask(*mask, dot.x, dot.y);
+        for (FloatPack& term : j) term *= described;
+      }
       for (std::size_t i = 0; i < 6; ++i)
         for (std::size_t l = 0; l <= i; ++l) sums[6 * i + l] += j[i] * j[l];
     }

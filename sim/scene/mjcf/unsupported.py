@@ -95,7 +95,7 @@ def _nonzero(model: Any, prefix: str, *fields: str) -> list[int]:
 
 def _elements(model: Any) -> Iterator[Unsupported]:
     tendons, bodies = element_names(model, "tendon", model.ntendon), element_names(model, "body", model.nbody)
-    actuated = model.actuator_trnid[model.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON, 0].tolist()
+    actuated = _actuated_tendons(model)
     stiff = _nonzero(
         model, "tendon_", "stiffness", "stiffnesspoly", "damping", "dampingpoly", "frictionloss", "limited", "armature"
     )
@@ -173,8 +173,12 @@ def _joints(model: Any) -> Iterator[Unsupported]:
 
 def _driven_by_tendons(model: Any) -> set[int]:
     """The joints that actuators drive by fixed tendons."""
-    actuated = model.actuator_trnid[model.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON, 0]
-    return {j for t in actuated for j in (tendon_terms(model, t) if is_fixed(model, t) else ())}
+    return {j for t in _actuated_tendons(model) if is_fixed(model, t) for j in tendon_terms(model, t)}
+
+
+def _actuated_tendons(model: Any) -> list[int]:
+    """The tendon of each actuator on a tendon."""
+    return list(map(int, model.actuator_trnid[model.actuator_trntype == mujoco.mjtTrn.mjTRN_TENDON, 0]))
 
 
 def _on_joint(model: Any) -> Any:
