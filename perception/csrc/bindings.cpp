@@ -96,8 +96,8 @@ TrackerSetup make_setup(int width, int height, int channel, bool bright, int row
   check_shape(rest, n, 2, "rest"), check_shape(shape, n, 8, "shape"), check_shape(visible, n, 0, "visible");
   check_shape(contrast, n, 0, "contrast"), check_shape(tolerated, n, 0, "tolerated"),
       check_shape(profile, DotProfile::steps + 1, 0, "profile"), check_shape(mask_of, n, 0, "mask_of");
-  TrackerSetup setup{width, height, {rows, cols}, Channel(channel), bright, spacing, radius, noise, {}, {}, {}, {},
-                     {},    {},     {},           {}};
+  TrackerSetup setup{
+      width, height, {rows, cols}, Channel(channel), bright, spacing, radius, noise, {}, {}, {}, {}, {}, {}, {}, {}};
   for (py::ssize_t i = 0; i <= DotProfile::steps; ++i) setup.profile.value[std::size_t(i)] = profile.at(i);
   setup.profile.reach = profile_reach;
   for (py::ssize_t m = 0; m < n; ++m) {
