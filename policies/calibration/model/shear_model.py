@@ -23,7 +23,6 @@ from gelflow.sim.tasks.insertion_randomization import ARM_JOINTS, simulator_para
 from gelflow.sim.tasks.parts.grasp import indentation, pad_gaps
 from gelflow.sim.tasks.parts.part_scene import hole_parameters
 from gelflow.sim.tasks.parts.registry import part_geometry
-from gelflow.sim.trajectory import Trajectory
 from gelflow.task import InsertionTask
 
 Array = NDArray[np.float64]
@@ -32,7 +31,8 @@ CONTACT_QUANTITIES = ("pad_kn", "pad_mu", "pad_ks", "marker_kn", "marker_mu", "m
 QUANTITIES = (*CONTACT_QUANTITIES, "arm_stiffness", "grasp_force", "grasp_height")
 _WITHOUT_GRASP = ("hole_kn", "hole_mu")  # have no effect on the grasp at rest
 POSE = ("x", "y", "yaw", "z")  # directions of the pose of a descent, after `QUANTITIES`
-_BATCH = 64  # descents that are simulated at once: the states of all their steps stay in memory, 100 MB
+_BATCH = 64  # descents that are simulated at once
+_SIZES = 8  # numbers of descents for which a simulator is kept
 _FINGERS = (("finger_left", "pad_left"), ("finger_right", "pad_right"))
 
 
@@ -85,11 +85,10 @@ class ShearModel:
         self._arm_q = [self.scene.q(name).start for name in ARM_JOINTS]
         self._arm_u = [self.scene.u(name) for name in ARM_JOINTS]
         self._sims: dict[int, Simulator] = {}
-        self._trajectories: dict[tuple[int, ...], Trajectory] = {}  # by steps and descents, to be overwritten
 
     def _sim(self, count: int) -> Simulator:
         if count not in self._sims:
-            if len(self._sims) > 3:
+            if len(self._sims) >= _SIZES:
                 self._sims.clear()
             self._sims[count] = Simulator(self.scene, num_envs=count, threads=self._threads)
         return self._sims[count]
@@ -110,32 +109,31 @@ class ShearModel:
         return change, ok
 
     def _shear(self, values: Mapping[str, Array], descents: Descents) -> tuple[Array, NDArray[np.bool_]]:
+        grasp, anchored, held = self._grasps(values)
+        q, u = self._start(grasp, descents)
         sim = self._sim(len(descents.depth))
-        grasp, anchored, held = self._grasp(sim, values)
-        q, controls = self._start(grasp, descents)
-        steps = self._steps(descents.depth)
-        u = np.repeat(controls[None], int(steps.max()) + self._hold_steps, axis=0)
-        z = self._arm_u[2]
-        for i, (count, depth) in enumerate(zip(steps, descents.depth, strict=True)):
-            first = int(steps.max()) - count  # descents end at the same time; before, the gripper is at rest
-            u[first : first + count, i, z] -= depth * np.arange(1, count + 1) / count
-            u[first + count :, i, z] -= depth
+        sim.params[:] = grasp.params
         sim.reset()
-        size = u.shape[:2]
-        if size not in self._trajectories and len(self._trajectories) > 3:
-            self._trajectories.clear()
-        trajectory = self._trajectories[size] = sim.rollout(
-            u,
-            q=q,
-            v=np.zeros_like(sim.v),
-            anchors=grasp.anchors,
-            anchored=anchored,
-            read_after=[len(u)],
-            out=self._trajectories.get(size),
-        )
-        ok = (trajectory.status == 0) & held
-        change = trajectory.tactile[0, :, :, :2] - grasp.shear
+        sim.q[:], sim.anchors[:], sim.anchored[:] = q, grasp.anchors, anchored
+        steps, z = self._steps(descents.depth), self._arm_u[2]
+        start, most = u[:, z].copy(), int(steps.max())
+        for step in range(1, most + 1):
+            # Descents end at the same time; before a descent begins, the gripper is at rest.
+            taken = np.maximum(step - (most - steps), 0)
+            u[:, z] = start - descents.depth * taken / steps
+            sim.step(u)
+        sim.step(u, self._hold_steps)
+        change = sim.tactile()[:, :, :2] - grasp.shear
+        ok = (sim.status == 0) & held
         return np.where(ok[:, None, None], change, 0.0), ok
+
+    def _grasps(self, values: Mapping[str, Array]) -> tuple[_Grasp, NDArray[np.uint8], NDArray[np.bool_]]:
+        """`_grasp` for each row of `values`; equal rows are simulated once."""
+        rows = np.stack([values[name] for name in QUANTITIES], axis=1)
+        different, of_row = np.unique(rows, axis=0, return_inverse=True)
+        sim = self._sim(len(different))
+        grasp, anchored, held = self._grasp(sim, dict(zip(QUANTITIES, different.T, strict=True)))
+        return _Grasp(*(array[of_row] for array in vars(grasp).values())), anchored[of_row], held[of_row]
 
     def _steps(self, depth: Array) -> NDArray[np.int64]:
         return np.maximum(1, np.round(depth / self.step_depth)).astype(np.int64)
