@@ -148,8 +148,8 @@ class ForceEstimator:
             moment=moment,
             centre_of_pressure=centre,
             contact_area=float((normal > _PRESSED * normal.max()).sum()) * self._pitch**2,
-            shear_deviation=np.sqrt(
-                spread[:2] ** 2 + (_SHEAR_ERROR * math.hypot(*total)) ** 2 + (modulus * total) ** 2
+            shear_deviation=np.array(
+                [math.hypot(spread[axis], _SHEAR_ERROR * math.hypot(*total), modulus * total[axis]) for axis in (0, 1)]
             ),
             normal_deviation=math.hypot(spread[2], _NORMAL_ERROR * pressed, modulus * pressed),
             moment_deviation=math.hypot(self._pitch * spread[3], _MOMENT_ERROR * moment, modulus * moment),

@@ -51,7 +51,7 @@ void load(Routine*& routine, const char* module, const char* name, const std::st
 }
 
 LinearAlgebra load_linear_algebra() {
-  constexpr const char *blas = "scipy.linalg.cython_blas", *lapack = "scipy.linalg.cython_lapack";
+  constexpr const char* blas = "scipy.linalg.cython_blas";
   LinearAlgebra algebra{};
   load(algebra.dgemm, blas, "dgemm",
        "void (char *, char *, int *, int *, int *, double *, double *, int *, double *, int *, double *, double *, int "
@@ -64,8 +64,7 @@ LinearAlgebra load_linear_algebra() {
        "void (char *, char *, int *, int *, double *, double *, int *, double *, double *, int *)");
   load(algebra.dtrsm, blas, "dtrsm",
        "void (char *, char *, char *, char *, int *, int *, double *, double *, int *, double *, int *)");
-  load(algebra.dpotrf, lapack, "dpotrf", "void (char *, int *, double *, int *, int *)");
-  load(algebra.dpotri, lapack, "dpotri", "void (char *, int *, double *, int *, int *)");
+  load(algebra.dpotrf, "scipy.linalg.cython_lapack", "dpotrf", "void (char *, int *, double *, int *, int *)");
   return algebra;
 }
 

@@ -3,6 +3,8 @@
 #include <functional>
 #include <numeric>
 
+#include "../clones.hpp"
+
 namespace gelflow::perception {
 
 namespace {
@@ -14,6 +16,20 @@ constexpr double largest_change = 0.3;              // of a in one step
 constexpr double converged = 0.05;                  // change of the ratios, below which no further step follows
 constexpr double rigid_prior[3] = {1.0, 1.0, 4.0};  // precision of a and ω: deviations of 1 and 0.5 per pitch
 constexpr int quantities = 7;                       // a (2), ω; the sums of the loads: shear x, y, normal, moment
+
+// out += G (the loads of one cell)
+GELFLOW_CLONES void add_response(GramRows rows, double shear_x, double shear_y, double normal, double* __restrict out) {
+  for (std::size_t i = 0; i < rows.size; ++i) out[i] += shear_x * rows.x[i] + shear_y * rows.y[i] + normal * rows.z[i];
+}
+
+// Adds what the shear of one cell adds to G T.
+GELFLOW_CLONES void add_motion(GramRows rows, double normal, double turn_x, double turn_y, double* __restrict along,
+                               double* __restrict across, double* __restrict turn) {
+  for (std::size_t i = 0; i < rows.size; ++i) {
+    const double x = rows.x[i], y = rows.y[i];
+    along[i] += normal * x, across[i] += normal * y, turn[i] += turn_x * x + turn_y * y;
+  }
+}
 
 double dot(const Values& a, const Values& b) { return std::inner_product(a.begin(), a.end(), b.begin(), 0.0); }
 
@@ -143,13 +159,13 @@ void ContactFitter::set_cells(const NormalEquations& image, const Values& deviat
   const std::size_t n = std::size_t(grid_.cells);
   const MatrixView precision = precision_.view(), equations = factor_.resize(2 * k, 2 * k);
   for (int j = 0; j < k; ++j) {
-    const double *along = image.gram + 3 * n * cell(j), *across = along + 3 * n * n;
+    const GramRows rows = image.rows(cell(j));
     double *column = equations.column(j), *next = equations.column(k + j) + k;
-    for (int i = 0; i < k; ++i) column[k + i] = image.weight * along[n + cell(i)];
+    for (int i = 0; i < k; ++i) column[k + i] = image.weight * rows.x[n + cell(i)];
     for (int i = j; i < k; ++i) {
       const double prior = precision(i, j) / (deviation[cell(i)] * deviation[cell(j)]);
-      column[i] = image.weight * along[cell(i)] + prior;
-      next[i] = image.weight * across[n + cell(i)] + prior;
+      column[i] = image.weight * rows.x[cell(i)] + prior;
+      next[i] = image.weight * rows.y[n + cell(i)] + prior;
     }
   }
   algebra_.factorize(equations);
@@ -159,14 +175,17 @@ void ContactFitter::set_precision() {
   const int k = remainder_cells_;
   if (std::equal(cells_.begin(), cells_.begin() + k, precision_cells_.begin(), precision_cells_.end())) return;
   precision_cells_.clear();
-  const MatrixView precision = precision_.resize(k, k);
+  const MatrixView correlation = correlation_.resize(k, k), inverse_factor = inverse_factor_.resize(k, k);
+  std::fill_n(inverse_factor.data, k * k, 0.0);
   for (int j = 0; j < k; ++j) {
     const double* column = grid_.correlation.data() + std::size_t(grid_.cells) * cell(j);
-    for (int i = j; i < k; ++i) precision(i, j) = column[cell(i)];
-    precision(j, j) += correlation_nugget;
+    for (int i = j; i < k; ++i) correlation(i, j) = column[cell(i)];
+    correlation(j, j) += correlation_nugget;
+    inverse_factor(j, j) = 1;
   }
-  algebra_.factorize(precision);
-  algebra_.invert(precision);
+  algebra_.factorize(correlation);
+  algebra_.solve_lower(correlation, inverse_factor);
+  algebra_.square(1.0, inverse_factor, 0.0, precision_.resize(k, k));
   precision_cells_.assign(cells_.begin(), cells_.begin() + k);
 }
 
@@ -202,12 +221,12 @@ void ContactFitter::set_load_equations(const NormalEquations& image, double scal
   const double weight = image.weight, prior = load_prior / (scale * scale);
   const Values& projected = image.projected;
   const MatrixView cross = cross_.resize(2 * k, m + 1), matrix = matrix_.resize(m, m);
-  row_.resize(loads), linear_.resize(std::size_t(m));
+  linear_.resize(std::size_t(m));
   for (int j = 0; j < m; ++j) {
     const std::size_t c = cell(j);
     const double along = ratio_x_[std::size_t(j)], across = ratio_y_[std::size_t(j)];
-    const double *x = image.gram + loads * c, *y = x + loads * n, *z = y + loads * n;
-    for (std::size_t i = 0; i < loads; ++i) row_[i] = weight * (z[i] + along * x[i] + across * y[i]);
+    row_.assign(loads, 0.0);
+    add_response(image.rows(c), weight * along, weight * across, weight, row_.data());
     double* column = cross.column(j);
     for (int i = 0; i < k; ++i) column[i] = row_[cell(i)], column[k + i] = row_[n + cell(i)];
     const double* roughness = grid_.roughness.data() + n * c;
@@ -221,7 +240,7 @@ void ContactFitter::set_load_equations(const NormalEquations& image, double scal
   double* right = cross.column(m);
   for (int i = 0; i < k; ++i) right[i] = weight * projected[cell(i)], right[k + i] = weight * projected[n + cell(i)];
   algebra_.solve_lower(factor_.view(), cross);
-  algebra_.subtract_square(cross.columns(0, m), matrix);
+  algebra_.square(-1.0, cross.columns(0, m), 1.0, matrix);
   algebra_.multiply_transposed(-1.0, cross.columns(0, m), right, 1.0, linear_.data());
 }
 
@@ -234,16 +253,9 @@ void ContactFitter::set_responses(const NormalEquations& image) {
     const double p = solver_.solution()[s], turn_x = -arm_y_[s] * p, turn_y = arm_x_[s] * p;
     const double along = ratio_x_[s] * p + (j < k ? remainder_[s] : 0.0);
     const double across = ratio_y_[s] * p + (j < k ? remainder_[std::size_t(k + j)] : 0.0);
-    const double *x = image.gram + loads * cell(j), *y = x + loads * n, *z = y + loads * n;
-    if (p > 0) {
-      for (std::size_t i = 0; i < loads; ++i) {
-        response_[i] += along * x[i] + across * y[i] + p * z[i];
-        response_x_[i] += p * x[i], response_y_[i] += p * y[i];
-        response_turn_[i] += turn_x * x[i] + turn_y * y[i];
-      }
-    } else if (j < k) {
-      for (std::size_t i = 0; i < loads; ++i) response_[i] += along * x[i] + across * y[i];
-    }
+    const GramRows rows = image.rows(cell(j));
+    add_response(rows, along, across, p, response_.data());
+    if (p > 0) add_motion(rows, p, turn_x, turn_y, response_x_.data(), response_y_.data(), response_turn_.data());
   }
 }
 

@@ -41,11 +41,23 @@ struct LayerGrid {
   Values roughness;    // S without its weight, (n, n)
 };
 
+// The rows of G of the loads on one cell.
+struct GramRows {
+  const double *x, *y, *z;
+  std::size_t size;
+};
+
 struct NormalEquations {
   const double* gram;  // G, (3n, 3n), symmetric; the loads: shear x of all cells, then shear y, then normal
   Values projected;    // Cᵀu, (3n)
   double square;       // |u|²
   double weight;       // w
+
+  GramRows rows(std::size_t cell) const {
+    const std::size_t size = projected.size(), block = size / 3 * size;
+    const double* x = gram + size * cell;
+    return {x, x + block, x + 2 * block, size};
+  }
 };
 
 // The shear loads are (a + ω × (position − centre)) p + r.
@@ -106,6 +118,7 @@ class ContactFitter {
   std::vector<int> cells_, precision_cells_;
   int remainder_cells_ = 0;
   Matrix precision_;                          // inverse of the correlation of the remainder at `precision_cells_`
+  Matrix correlation_, inverse_factor_;       // its Cholesky factor, and the inverse of that
   Matrix factor_;                             // L, (2k, 2k)
   Values ratio_x_, ratio_y_, arm_x_, arm_y_;  // A and position − centre of the cells
   Matrix cross_, matrix_;                     // (W, v), (2k, m + 1); M, (m, m)

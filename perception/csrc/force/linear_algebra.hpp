@@ -53,7 +53,7 @@ struct LinearAlgebra {
   Symv* dsymv;
   Syrk* dsyrk;
   Trsm* dtrsm;
-  Potrf *dpotrf, *dpotri;
+  Potrf* dpotrf;
 
   // Replaces a symmetric matrix by its lower Cholesky factor. Throws NotPositiveDefinite.
   void factorize(MatrixView a) const {
@@ -61,12 +61,6 @@ struct LinearAlgebra {
     int info = 0;
     dpotrf(&lower, &a.rows, a.data, &a.stride, &info);
     if (info != 0) throw NotPositiveDefinite("the equations of the loads are not positive definite");
-  }
-  // Replaces a Cholesky factor by the inverse of its matrix.
-  void invert(MatrixView factor) const {
-    char lower = 'L';
-    int info = 0;
-    dpotri(&lower, &factor.rows, factor.data, &factor.stride, &info);
   }
   // b = L⁻¹ b
   void solve_lower(MatrixView factor, MatrixView b) const { solve_triangle('N', factor, b); }
@@ -78,11 +72,10 @@ struct LinearAlgebra {
     dgemm(&transposed, &plain, &c.rows, &c.cols, &a.rows, &alpha, a.data, &a.stride, b.data, &b.stride, &beta, c.data,
           &c.stride);
   }
-  // c −= aᵀ a, for a symmetric c
-  void subtract_square(MatrixView a, MatrixView c) const {
+  // c = α aᵀ a + β c, for a symmetric c
+  void square(double alpha, MatrixView a, double beta, MatrixView c) const {
     char lower = 'L', transposed = 'T';
-    double minus = -1, one = 1;
-    dsyrk(&lower, &transposed, &c.rows, &a.rows, &minus, a.data, &a.stride, &one, c.data, &c.stride);
+    dsyrk(&lower, &transposed, &c.rows, &a.rows, &alpha, a.data, &a.stride, &beta, c.data, &c.stride);
   }
   // y = α a x + β y
   void multiply(double alpha, MatrixView a, double* x, double beta, double* y) const {
