@@ -6,9 +6,18 @@ REMAINDER: float
 REMAINDER_FLOOR: float
 
 class NormalEquations:
-    def __init__(
-        self, *, gram: NDArray[np.float64], projected: NDArray[np.float64], square: float, weight: float
-    ) -> None: ...
+    @property
+    def projected(self) -> NDArray[np.float64]: ...
+
+class LoadSums:
+    @property
+    def shear(self) -> NDArray[np.float64]: ...
+    @property
+    def normal(self) -> float: ...
+    @property
+    def centre(self) -> NDArray[np.float64]: ...
+    @property
+    def moment(self) -> float: ...
 
 class ContactFit:
     @property
@@ -22,7 +31,11 @@ class ContactFit:
     @property
     def remainder(self) -> NDArray[np.float64]: ...
     @property
+    def sums(self) -> LoadSums: ...
+    @property
     def cost(self) -> float: ...
+    @property
+    def unexplained(self) -> float: ...
     @property
     def rigid_covariance(self) -> NDArray[np.float64]: ...
     @property
@@ -37,7 +50,11 @@ class ContactFitter:
         correlation: NDArray[np.float64],
         smoothing: NDArray[np.float64],
         roughness: NDArray[np.float64],
+        compliance: NDArray[np.float64],
     ) -> None: ...
+    def equations(
+        self, gram: NDArray[np.float64], displacement: NDArray[np.float64], valid: NDArray[np.bool_], noise: float
+    ) -> NormalEquations: ...
     def first(
         self,
         image: NormalEquations,

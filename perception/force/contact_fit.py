@@ -56,6 +56,7 @@ class LayerModel:
             correlation=self.correlation,
             smoothing=self.smoothing,
             roughness=self.roughness,
+            compliance=self.compliance,
         )
         self._gram_of_all = self.compliance.T @ self.compliance
         self._gram: tuple[bytes, Array] = (np.ones(n, bool).tobytes(), self._gram_of_all)
@@ -80,12 +81,11 @@ def fit_contact(
     noise: standard deviation of a displacement along one axis [pitches]
     start: the fit of the image before, None at the start of a contact
     """
-    measured = np.where(valid[:, None], displacement, 0.0).T.ravel()
-    gram, projected, weight = model.gram(valid), measured @ model.compliance, 1 / noise**2
-    image = NormalEquations(gram=gram, projected=projected, square=float(measured @ measured), weight=weight)
+    gram = model.gram(valid)
+    image = model.fitter.equations(gram, displacement, valid, noise)
     if start is not None:
         return model.fitter.follow(image, start)
-    fit = _first_fit(model, image, weight * gram, weight * projected)
+    fit = _first_fit(model, image, gram / noise**2, image.projected / noise**2)
     for _ in range(_STEPS):
         fit = model.fitter.step(image, fit)
     return fit

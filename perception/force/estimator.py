@@ -72,6 +72,7 @@ class ForceEstimator:
         self._pitch = grid.pitch * 1e-3
         self._noise = noise / self._pitch
         self._positions = grid.positions() * 1e-3
+        self._middle = self._positions.mean(0)
         self._blas = ThreadpoolController().select(user_api="blas")
         self._model = LayerModel(grid.rows, grid.cols, gel.poisson_ratio, gel.thickness / self._pitch)
         self._fit: ContactFit | None = None
@@ -127,35 +128,30 @@ class ForceEstimator:
         if not fit.normal.any():
             self._fit = None
             return self._no_contact()
-        return self._contact(fit, measured, valid)
+        return self._contact(fit, measured.size)
 
-    def _contact(self, fit: ContactFit, measured: Array, valid: NDArray[np.bool_]) -> ForceEstimate:
+    def _contact(self, fit: ContactFit, values: int) -> ForceEstimate:
+        """`values` is the number of measured values, two for each marker."""
         force = self.gel.youngs_modulus * self._pitch**2  # unit of the loads [N]
-        shear, normal = fit.shear(self._model.position), fit.normal
-        loads = np.concatenate([shear.ravel(), normal])
-        left = measured - (self._model.compliance @ loads).reshape(2, -1).T[valid]
-        centre = normal @ self._positions / normal.sum()
-        arm = self._positions - centre
-        total = force * shear.sum(1)
-        pressed = float(force * normal.sum())
-        moment = float(force * (arm[:, 0] @ shear[1] - arm[:, 1] @ shear[0]))
-        spread = force * np.sqrt(fit.rigid_covariance.diagonal() * max(1.0, fit.cost / measured.size))
+        sums, normal = fit.sums, fit.normal
+        total, pressed, moment = force * sums.shear, force * sums.normal, force * self._pitch * sums.moment
+        spread = force * np.sqrt(fit.rigid_covariance.diagonal() * max(1.0, fit.cost / values))
         modulus = self.gel.youngs_modulus_deviation
         return ForceEstimate(
             contact=True,
             shear=total,
             normal=pressed,
             moment=moment,
-            centre_of_pressure=centre,
+            centre_of_pressure=self._middle + self._pitch * sums.centre,
             contact_area=float((normal > _PRESSED * normal.max()).sum()) * self._pitch**2,
             shear_deviation=np.array(
                 [math.hypot(spread[axis], _SHEAR_ERROR * math.hypot(*total), modulus * total[axis]) for axis in (0, 1)]
             ),
             normal_deviation=math.hypot(spread[2], _NORMAL_ERROR * pressed, modulus * pressed),
             moment_deviation=math.hypot(self._pitch * spread[3], _MOMENT_ERROR * moment, modulus * moment),
-            shear_field=force * shear.T,
+            shear_field=force * fit.shear(self._model.position).T,
             normal_field=force * normal,
-            unexplained=math.sqrt(float(np.vdot(left, left)) / float(np.vdot(measured, measured))),
+            unexplained=fit.unexplained,
         )
 
     def _no_contact(self) -> ForceEstimate:
@@ -167,7 +163,7 @@ class ForceEstimator:
         kappa = 3 - 4 * self.gel.poisson_ratio
         spreading = abs(1 - (1 - 2 * self.gel.poisson_ratio) * kappa) * 2 / (1 + kappa) ** 2
         n, cell, thickness = len(self._positions), self._pitch**2, self.gel.thickness
-        noise, arm = self._noise * self._pitch, self._positions - self._positions.mean(0)
+        noise, arm = self._noise * self._pitch, self._positions - self._middle
         stiffness = self.gel.youngs_modulus / (2 * (1 + self.gel.poisson_ratio)) * cell
         radius = math.sqrt(float((arm**2).sum()))
         shear = stiffness / thickness * noise * math.sqrt(n)

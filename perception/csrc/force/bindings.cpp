@@ -78,13 +78,6 @@ struct HeldEquations : NormalEquations {
   Array<double> held_gram;
 };
 
-HeldEquations make_equations(Array<double> gram, const Array<double>& projected, double square, double weight) {
-  const py::ssize_t loads = projected.size();
-  NormalEquations equations{checked(gram, {loads, loads}, "gram"), values(projected, {loads}, "projected"), square,
-                            weight};
-  return {std::move(equations), std::move(gram)};
-}
-
 // A fitter with a lock, so that threads can share it while the interpreter lock is released.
 struct SharedFitter {
   ContactFitter fitter;
@@ -107,18 +100,33 @@ struct SharedFitter {
 };
 
 std::unique_ptr<SharedFitter> make_fitter(const Array<double>& position, const Array<double>& correlation,
-                                          const Array<double>& smoothing, const Array<double>& roughness) {
+                                          const Array<double>& smoothing, const Array<double>& roughness,
+                                          const Array<double>& compliance) {
   const py::ssize_t n = position.ndim() ? position.shape(0) : 0;
   if (n < 1 || n > 10000) throw std::invalid_argument("expected 1 to 10000 cells");
   LayerGrid grid{int(n),
                  {},
                  {},
+                 values(compliance, {2 * n, 3 * n}, "compliance"),
                  values(correlation, {n, n}, "correlation"),
                  values(smoothing, {n, n}, "smoothing"),
                  values(roughness, {n, n}, "roughness")};
   checked(position, {n, 2}, "position");
   for (py::ssize_t i = 0; i < n; ++i) grid.x.push_back(position.at(i, 0)), grid.y.push_back(position.at(i, 1));
   return std::make_unique<SharedFitter>(std::move(grid));
+}
+
+HeldEquations equations(SharedFitter& shared, Array<double> gram, const Array<double>& displacement,
+                        const Array<bool>& valid, double noise) {
+  const py::ssize_t n = shared.fitter.grid().cells;
+  checked(gram, {3 * n, 3 * n}, "gram"), checked(displacement, {n, 2}, "displacement"), checked(valid, {n}, "valid");
+  Values measured(std::size_t(2 * n), 0.0);
+  for (py::ssize_t i = 0; i < n; ++i)
+    if (valid.at(i)) {
+      measured[std::size_t(i)] = displacement.at(i, 0), measured[std::size_t(n + i)] = displacement.at(i, 1);
+    }
+  NormalEquations equations = shared.fitter.equations(gram.data(), std::move(measured), 1 / (noise * noise));
+  return {std::move(equations), std::move(gram)};
 }
 
 ContactFit first(SharedFitter& shared, const HeldEquations& image, const Array<double>& ratios,
@@ -175,8 +183,14 @@ PYBIND11_MODULE(_contact_fit, module) {
   });
   const auto cells = [](const ContactFit& fit) { return py::ssize_t(fit.normal.size()); };
   py::class_<HeldEquations>(module, "NormalEquations")
-      .def(py::init(&make_equations), py::kw_only(), py::arg("gram"), py::arg("projected"), py::arg("square"),
-           py::arg("weight"));
+      .def_property_readonly("projected", [](const HeldEquations& image) {
+        return to_array<double>(image.projected, {py::ssize_t(image.projected.size())});
+      });
+  py::class_<LoadSums>(module, "LoadSums")
+      .def_property_readonly("shear", [](const LoadSums& sums) { return to_array<double>(sums.shear, {2}); })
+      .def_readonly("normal", &LoadSums::normal)
+      .def_property_readonly("centre", [](const LoadSums& sums) { return to_array<double>(sums.centre, {2}); })
+      .def_readonly("moment", &LoadSums::moment);
   py::class_<ContactFit>(module, "ContactFit")
       .def_property_readonly("ratio", [](const ContactFit& fit) { return to_array<double>(fit.ratio, {2}); })
       .def_readonly("twist", &ContactFit::twist)
@@ -185,14 +199,17 @@ PYBIND11_MODULE(_contact_fit, module) {
                              [=](const ContactFit& fit) { return to_array<double>(fit.normal, {cells(fit)}); })
       .def_property_readonly("remainder",
                              [=](const ContactFit& fit) { return to_array<double>(fit.remainder, {2, cells(fit)}); })
+      .def_readonly("sums", &ContactFit::sums)
       .def_readonly("cost", &ContactFit::cost)
+      .def_readonly("unexplained", &ContactFit::unexplained)
       .def_property_readonly("rigid_covariance",
                              [](const ContactFit& fit) { return to_array<double>(fit.rigid_covariance, {4, 4}); })
       .def_property_readonly("wanted", [=](const ContactFit& fit) { return to_array<bool>(fit.wanted, {cells(fit)}); })
       .def("shear", &shear, py::arg("position"));
   py::class_<SharedFitter>(module, "ContactFitter")
       .def(py::init(&make_fitter), py::kw_only(), py::arg("position"), py::arg("correlation"), py::arg("smoothing"),
-           py::arg("roughness"))
+           py::arg("roughness"), py::arg("compliance"))
+      .def("equations", &equations, py::arg("gram"), py::arg("displacement"), py::arg("valid"), py::arg("noise"))
       .def("first", &first, py::arg("image"), py::kw_only(), py::arg("ratios"), py::arg("scales"), py::arg("deviation"),
            py::arg("centre"))
       .def(

@@ -22,12 +22,16 @@
 #pragma once
 
 #include <array>
+#include <numeric>
 
 #include "nonnegative.hpp"
 
 namespace gelflow::perception {
 
 using Values = std::vector<double>;
+
+inline double sum(const Values& a) { return std::accumulate(a.begin(), a.end(), 0.0); }
+inline double dot(const Values& a, const Values& b) { return std::inner_product(a.begin(), a.end(), b.begin(), 0.0); }
 
 constexpr double smallest_load = 0.03;    // scale of the load of a cell where nothing is known
 constexpr double remainder_share = 0.15;  // r relative to the shear of the rigid motion
@@ -36,6 +40,7 @@ constexpr double remainder_floor = 0.06;
 struct LayerGrid {
   int cells;           // n
   Values x, y;         // positions [pitches]
+  Values compliance;   // C, (2n, 3n)
   Values correlation;  // of the remainder, (n, n)
   Values smoothing;    // weights of a local mean, (n, n)
   Values roughness;    // S without its weight, (n, n)
@@ -60,14 +65,24 @@ struct NormalEquations {
   }
 };
 
+struct LoadSums {
+  std::array<double, 2> shear{};
+  double normal = 0;
+  std::array<double, 2> centre{};  // of pressure
+  double moment = 0;               // of the shear about it
+  double inertia = 0;              // sum of the normal loads times their squared distances from it
+};
+
 // The shear loads are (a + ω × (position − centre)) p + r.
 struct ContactFit {
   std::array<double, 2> ratio{};   // a
   double twist = 0;                // ω
-  std::array<double, 2> centre{};  // of pressure
+  std::array<double, 2> centre{};  // of pressure before the last step
   Values normal;                   // p, (n)
   Values remainder;                // r, (2n)
+  LoadSums sums;
   double cost = 0;
+  double unexplained = 0;                     // |u − C t| / |u|
   std::array<double, 16> rigid_covariance{};  // of the sums of the loads: shear x, y, normal, moment; (4, 4)
   std::vector<char> wanted;                   // cells outside of the contact that a normal load would improve, (n)
 
@@ -85,6 +100,8 @@ class ContactFitter {
   ContactFitter(const LinearAlgebra& algebra, LayerGrid grid);
 
   const LayerGrid& grid() const { return grid_; }
+  // The equations of displacements, (2n), along the rows of the grid, then along its columns.
+  NormalEquations equations(const double* gram, Values displacement, double weight);
   // The fit with the lowest cost of those with one ratio everywhere and no twist. `scales` are those of p for each
   // ratio, `deviation` is that of the remainder.
   ContactFit first(const NormalEquations& image, const std::vector<std::array<double, 2>>& ratios, const Values& scales,
@@ -96,9 +113,7 @@ class ContactFitter {
 
  private:
   std::size_t cell(int j) const { return std::size_t(cells_[std::size_t(j)]); }
-  void move_to_centre_of_pressure(ContactFit& fit) const;
-  ContactFit gather(const ContactFit& fit) const;
-  double ratio_change(const ContactFit& before, const ContactFit& after) const;
+  LoadSums sum_loads(const ContactFit& fit) const;
   Values remainder_deviation(const ContactFit& fit);
   void set_cells(const NormalEquations& image, const Values& deviation, const std::vector<char>& pressed);
   void set_precision();
@@ -111,6 +126,7 @@ class ContactFitter {
   void eliminate_loads();
   void solve_rigid(ContactFit& fit);
   void change_loads(double* step, ContactFit& fit);
+  double unexplained(const NormalEquations& image, const ContactFit& fit);
 
   LinearAlgebra algebra_;
   LayerGrid grid_;

@@ -5,7 +5,7 @@ import pytest
 from scipy.linalg import block_diag
 from scipy.optimize import nnls
 
-from gelflow.perception.force._contact_fit import REMAINDER, REMAINDER_FLOOR, SMALLEST_LOAD, ContactFit, NormalEquations
+from gelflow.perception.force._contact_fit import REMAINDER, REMAINDER_FLOOR, SMALLEST_LOAD, ContactFit
 from gelflow.perception.force.contact_fit import LayerModel
 
 MODEL = LayerModel(5, 6, 0.48, 2.0)
@@ -85,15 +85,10 @@ def test_steps_agree_with_the_equations_of_all_unknowns(seed: int) -> None:
     pressed = np.maximum(1 - ((MODEL.position - place) ** 2).sum(1) / rng.uniform(2, 5), 0.0)
     shear = rng.uniform(-0.5, 0.5, (2, 1)) * pressed + 0.02 * rng.normal(size=(2, N))
     measured = MODEL.compliance @ np.concatenate([shear.ravel(), pressed]) + 0.005 * rng.normal(size=2 * N)
-    weight = 1 / 0.01**2
-    image = NormalEquations(
-        gram=MODEL.gram(np.ones(N, bool)),
-        projected=measured @ MODEL.compliance,
-        square=measured @ measured,
-        weight=weight,
-    )
+    valid, noise = np.ones(N, bool), 0.01
+    image = MODEL.fitter.equations(MODEL.gram(valid), measured.reshape(2, N).T, valid, noise)
     ratios, scales = rng.uniform(-0.5, 0.5, (3, 2)), np.full(3, 0.5)
     fit = MODEL.fitter.first(image, ratios=ratios, scales=scales, deviation=0.05, centre=place)
     for _ in range(3):
         last, fit = fit, MODEL.fitter.step(image, fit)
-        check_step(measured, weight, last, fit)
+        check_step(measured, 1 / noise**2, last, fit)
