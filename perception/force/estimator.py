@@ -11,7 +11,8 @@ from gelflow.errors import UsageError
 from gelflow.gel.creep import CreepCorrection
 from gelflow.gel.gel_file import ElasticGel
 from gelflow.observation import Grid
-from gelflow.perception.force.contact_fit import ContactFit, LayerModel, fit_contact
+from gelflow.perception.force._contact_fit import ContactFit
+from gelflow.perception.force.contact_fit import LayerModel, fit_contact
 
 Array = NDArray[np.float64]
 

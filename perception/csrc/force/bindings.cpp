@@ -36,7 +36,7 @@ py::array_t<T> to_array(const Container& container, const Shape& shape) {
 }
 
 // The routine of this name that SciPy exports for Cython, so that nothing else is linked. Its signature is the name of
-// the capsule, with a type name of Cython for double; integers of another width have another one.
+// the capsule, with a type name of Cython for double. Integers of another width would have another signature.
 template <class Routine>
 void load(Routine*& routine, const char* module, const char* name, const std::string& signature) {
   const py::dict routines = py::module_::import(module).attr("__pyx_capi__");
@@ -166,21 +166,7 @@ py::array_t<double> solve_nonnegative(const Array<double>& hessian, const Array<
   return to_array<double>(solver.solution(), {n});
 }
 
-}  // namespace
-
-PYBIND11_MODULE(_contact_fit, module) {
-  module.doc() = "Steps of the fit of contact forces.";
-  module.attr("SMALLEST_LOAD") = smallest_load;
-  module.attr("REMAINDER") = remainder_share;
-  module.attr("REMAINDER_FLOOR") = remainder_floor;
-  linear_algebra();
-  py::register_local_exception_translator([](std::exception_ptr exception) {
-    try {
-      if (exception) std::rethrow_exception(exception);
-    } catch (const NotPositiveDefinite& error) {
-      py::set_error(py::module_::import("numpy.linalg").attr("LinAlgError"), error.what());
-    }
-  });
+void bind_fit(py::module_& module) {
   const auto cells = [](const ContactFit& fit) { return py::ssize_t(fit.normal.size()); };
   py::class_<HeldEquations>(module, "NormalEquations")
       .def_property_readonly("projected", [](const HeldEquations& image) {
@@ -206,6 +192,24 @@ PYBIND11_MODULE(_contact_fit, module) {
                              [](const ContactFit& fit) { return to_array<double>(fit.rigid_covariance, {4, 4}); })
       .def_property_readonly("wanted", [=](const ContactFit& fit) { return to_array<bool>(fit.wanted, {cells(fit)}); })
       .def("shear", &shear, py::arg("position"));
+}
+
+}  // namespace
+
+PYBIND11_MODULE(_contact_fit, module) {
+  module.doc() = "Steps of the fit of contact forces.";
+  module.attr("SMALLEST_LOAD") = smallest_load;
+  module.attr("REMAINDER") = remainder_share;
+  module.attr("REMAINDER_FLOOR") = remainder_floor;
+  linear_algebra();
+  py::register_local_exception_translator([](std::exception_ptr exception) {
+    try {
+      if (exception) std::rethrow_exception(exception);
+    } catch (const NotPositiveDefinite& error) {
+      py::set_error(py::module_::import("numpy.linalg").attr("LinAlgError"), error.what());
+    }
+  });
+  bind_fit(module);
   py::class_<SharedFitter>(module, "ContactFitter")
       .def(py::init(&make_fitter), py::kw_only(), py::arg("position"), py::arg("correlation"), py::arg("smoothing"),
            py::arg("roughness"), py::arg("compliance"))

@@ -96,7 +96,7 @@ double ContactFitter::solve_loads(const NormalEquations& image, double scale, co
   remainder_.assign(right, right + rows);
   const double cost = image.weight * image.square - dot(remainder_, remainder_) - dot(linear_, solver_.solution());
   algebra_.multiply(-1.0, cross.columns(0, m), solver_.solution().data(), 1.0, remainder_.data());
-  algebra_.solve_lower_transposed(factor_.view(), {remainder_.data(), rows, 1, rows});
+  algebra_.solve_upper(factor_.view(), {remainder_.data(), rows, 1, rows});
   return cost;
 }
 
@@ -127,7 +127,7 @@ void ContactFitter::set_load_equations(const NormalEquations& image, double scal
   for (int i = 0; i < k; ++i) right[i] = weight * projected[cell(i)], right[k + i] = weight * projected[n + cell(i)];
   algebra_.solve_lower(factor_.view(), cross);
   algebra_.square(-1.0, cross.columns(0, m), 1.0, matrix);
-  algebra_.multiply_transposed(-1.0, cross.columns(0, m), right, 1.0, linear_.data());
+  algebra_.transpose_multiply(-1.0, cross.columns(0, m), right, 1.0, linear_.data());
 }
 
 void ContactFitter::set_responses(const NormalEquations& image) {
@@ -197,25 +197,25 @@ void ContactFitter::eliminate_loads() {
       of_normal(j, q) = z[j] + ratio_x_[std::size_t(j)] * x[j] + ratio_y_[std::size_t(j)] * y[j];
   }
   algebra_.solve_lower(factor_.view(), of_remainder);
-  algebra_.multiply_transposed(1.0, of_remainder, of_remainder, 0.0, explained);
-  algebra_.multiply_transposed(-1.0, cross_.view().columns(0, m), of_remainder, 1.0, of_normal);
+  algebra_.transpose_multiply(1.0, of_remainder, of_remainder, 0.0, explained);
+  algebra_.transpose_multiply(-1.0, cross_.view().columns(0, m), of_remainder, 1.0, of_normal);
   const std::vector<int>& positive = solver_.positive();
   const MatrixView of_positive = of_positive_.resize(int(positive.size()), quantities);
   if (positive.empty()) return;
   for (int q = 0; q < quantities; ++q)
     for (int i = 0; i < of_positive.rows; ++i) of_positive(i, q) = of_normal(positive[std::size_t(i)], q);
   algebra_.solve_lower(solver_.factor(), of_positive);
-  algebra_.multiply_transposed(1.0, of_positive, of_positive, 1.0, explained);
+  algebra_.transpose_multiply(1.0, of_positive, of_positive, 1.0, explained);
 }
 
 // Solves the equations of a and ω that remain, and changes the fit by the step.
 void ContactFitter::solve_rigid(ContactFit& fit) {
   const MatrixView shear = shear_.view(), explained = explained_.view(), of_rigid = of_rigid_.resize(3, quantities);
-  algebra_.multiply_transposed(1.0, shear, coupling_.view().top(shear.rows), 0.0, of_rigid);
+  algebra_.transpose_multiply(1.0, shear, coupling_.view().top(shear.rows), 0.0, of_rigid);
   std::array<double, 9> matrix;
   std::array<double, 15> right{};  // the slope, and the sums of the loads
   const MatrixView equations{matrix.data(), 3, 3, 3}, solved{right.data(), 3, 5, 3};
-  algebra_.multiply_transposed(1.0, shear, gradient_.data(), 0.0, solved.column(0));
+  algebra_.transpose_multiply(1.0, shear, gradient_.data(), 0.0, solved.column(0));
   const double rigid[3] = {fit.ratio[0], fit.ratio[1], fit.twist};
   for (int i = 0; i < 3; ++i) {
     for (int q = 0; q < 3; ++q) equations(i, q) = of_rigid(i, q) - explained(i, q);
@@ -230,7 +230,7 @@ void ContactFitter::solve_rigid(ContactFit& fit) {
       double& entry = fit.rigid_covariance[std::size_t(4 * i + j)] = explained(3 + i, 3 + j);
       for (int row = 0; row < 3; ++row) entry += solved(row, 1 + i) * solved(row, 1 + j);
     }
-  algebra_.solve_lower_transposed(equations, solved.columns(0, 1));
+  algebra_.solve_upper(equations, solved.columns(0, 1));
   const double share = std::min(1.0, largest_change / std::max(std::hypot(solved(0, 0), solved(1, 0)), 1e-30));
   for (int i = 0; i < 3; ++i) solved(i, 0) *= share;
   fit.ratio[0] += solved(0, 0), fit.ratio[1] += solved(1, 0), fit.twist += solved(2, 0);
@@ -248,13 +248,13 @@ void ContactFitter::change_loads(double* step, ContactFit& fit) {
   if (!positive.empty()) {
     positive_change_.assign(positive.size(), 0.0);
     algebra_.multiply(-1.0, of_positive, step, 0.0, positive_change_.data());
-    algebra_.solve_lower_transposed(solver_.factor(), {positive_change_.data(), of_positive.rows, 1, of_positive.rows});
+    algebra_.solve_upper(solver_.factor(), {positive_change_.data(), of_positive.rows, 1, of_positive.rows});
     for (std::size_t i = 0; i < positive.size(); ++i) change_[std::size_t(positive[i])] = positive_change_[i];
   }
   remainder_change_.assign(std::size_t(2 * k), 0.0);
   algebra_.multiply(-1.0, of_remainder_.view().columns(0, 3), step, 0.0, remainder_change_.data());
   algebra_.multiply(-1.0, cross_.view().columns(0, m), change_.data(), 1.0, remainder_change_.data());
-  algebra_.solve_lower_transposed(factor_.view(), {remainder_change_.data(), 2 * k, 1, 2 * k});
+  algebra_.solve_upper(factor_.view(), {remainder_change_.data(), 2 * k, 1, 2 * k});
   fit.normal.assign(n, 0.0), fit.remainder.assign(2 * n, 0.0);
   for (std::size_t j = 0; j < cells_.size(); ++j) {
     const std::size_t i = std::size_t(cells_[j]), s = std::size_t(k);

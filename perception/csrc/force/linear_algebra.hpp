@@ -65,9 +65,9 @@ struct LinearAlgebra {
   // b = L⁻¹ b
   void solve_lower(MatrixView factor, MatrixView b) const { solve_triangle('N', factor, b); }
   // b = L⁻ᵀ b
-  void solve_lower_transposed(MatrixView factor, MatrixView b) const { solve_triangle('T', factor, b); }
+  void solve_upper(MatrixView factor, MatrixView b) const { solve_triangle('T', factor, b); }
   // c = α aᵀ b + β c
-  void multiply_transposed(double alpha, MatrixView a, MatrixView b, double beta, MatrixView c) const {
+  void transpose_multiply(double alpha, MatrixView a, MatrixView b, double beta, MatrixView c) const {
     char transposed = 'T', plain = 'N';
     dgemm(&transposed, &plain, &c.rows, &c.cols, &a.rows, &alpha, a.data, &a.stride, b.data, &b.stride, &beta, c.data,
           &c.stride);
@@ -82,7 +82,7 @@ struct LinearAlgebra {
     gemv('N', alpha, a, x, beta, y);
   }
   // y = α aᵀ x + β y
-  void multiply_transposed(double alpha, MatrixView a, double* x, double beta, double* y) const {
+  void transpose_multiply(double alpha, MatrixView a, double* x, double beta, double* y) const {
     gemv('T', alpha, a, x, beta, y);
   }
   // y = a x + β y, for a symmetric a

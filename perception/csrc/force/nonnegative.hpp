@@ -72,7 +72,7 @@ class NonnegativeSolver {
     const int count = int(positive_.size());
     const MatrixView right{right_.data(), count, 1, count};
     algebra_.solve_lower(factor_.view(), right);
-    algebra_.solve_lower_transposed(factor_.view(), right);
+    algebra_.solve_upper(factor_.view(), right);
     for (std::size_t i = 0; i < positive_.size(); ++i) x_[std::size_t(positive_[i])] = right_[i];
   }
 

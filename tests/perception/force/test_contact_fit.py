@@ -5,7 +5,8 @@ import pytest
 
 from gelflow.gel.gel_file import ElasticGel
 from gelflow.observation import Grid
-from gelflow.perception.force.contact_fit import ContactFit, LayerModel, fit_contact
+from gelflow.perception.force._contact_fit import ContactFit
+from gelflow.perception.force.contact_fit import LayerModel, fit_contact
 from gelflow.perception.force.estimator import ForceEstimator
 from gelflow.perception.synthetic.pressed_layer import SHAPES, Press, PressedLayer, Shape
 

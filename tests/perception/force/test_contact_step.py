@@ -14,7 +14,8 @@ N = MODEL.markers
 
 def remainder_deviation(normal: np.ndarray, rigid: np.ndarray) -> np.ndarray:
     around = MODEL.smoothing @ (0.3 * np.sqrt(normal * normal.max()) + 0.7 * normal)
-    return 1.5 * around * (REMAINDER * (np.hypot(*rigid[:2]) + 1.3 * abs(rigid[2])) + REMAINDER_FLOOR) + 1e-6
+    shear = REMAINDER * (np.hypot(*rigid[:2]) + 1.3 * abs(rigid[2])) + REMAINDER_FLOOR
+    return np.asarray(1.5 * around * shear + 1e-6)
 
 
 def unit_loads(rigid: np.ndarray, arm: np.ndarray, inner: np.ndarray, cells: np.ndarray) -> np.ndarray:
