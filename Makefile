@@ -25,7 +25,7 @@ BUILD_TOOLS := scikit-build-core pybind11 cmeel-eigen cmake ninja
 SETUP := .venv/.gelflow-setup
 WHEEL := build/wheel
 DOCS_SETUP := .venv/.gelflow-docs
-CXX_FILES = $(wildcard $(foreach folder,sim/csrc sim/csrc/* perception/csrc,$(folder)/*.cpp $(folder)/*.hpp))
+CXX_FILES = $(wildcard $(foreach folder,sim/csrc sim/csrc/* perception/csrc perception/csrc/*,$(folder)/*.cpp $(folder)/*.hpp))
 
 # The sanitizers' libraries come first in the process, and the C++ library, whose exceptions they watch.
 SANITIZE_BUILD := build/sanitize
@@ -108,5 +108,5 @@ $(DOCS_SETUP): $(SETUP)
 	@touch $@
 
 clean:
-	rm -rf build dist sim/_core*.so perception/_tracker*.so .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis $(SETUP) $(DOCS_SETUP)
+	rm -rf build dist sim/_core*.so perception/_tracker*.so perception/force/_contact_fit*.so .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis $(SETUP) $(DOCS_SETUP)
 	find sim perception policies real hardware_mocks src tests benchmarks -name __pycache__ -prune -exec rm -rf {} +

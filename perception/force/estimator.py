@@ -11,7 +11,8 @@ from gelflow.errors import UsageError
 from gelflow.gel.creep import CreepCorrection
 from gelflow.gel.gel_file import ElasticGel
 from gelflow.observation import Grid
-from gelflow.perception.force.contact_fit import ContactFit, LayerModel, fit_contact
+from gelflow.perception.force._contact_fit import ContactFit
+from gelflow.perception.force.contact_fit import LayerModel, fit_contact
 
 Array = NDArray[np.float64]
 
@@ -72,6 +73,7 @@ class ForceEstimator:
         self._pitch = grid.pitch * 1e-3
         self._noise = noise / self._pitch
         self._positions = grid.positions() * 1e-3
+        self._middle = self._positions.mean(0)
         self._blas = ThreadpoolController().select(user_api="blas")
         self._model = LayerModel(grid.rows, grid.cols, gel.poisson_ratio, gel.thickness / self._pitch)
         self._fit: ContactFit | None = None
@@ -102,23 +104,23 @@ class ForceEstimator:
                 f"expected displacements of shape ({markers}, 2) and valid of shape ({markers},), got "
                 f"{displacement.shape} and {valid.shape}"
             )
-        measured = displacement[valid] / self._pitch
-        if not np.isfinite(measured).all():
+        if not np.isfinite(displacement[valid]).all():
             raise UsageError("a displacement of a valid marker is not finite")
         if self.gel.creep:
             if stamp is None or not math.isfinite(stamp):
                 raise UsageError("a gel with creep needs the time of each image: give stamp [s]")
             displacement = self._creep.undo(displacement, np.repeat(valid[:, None], 2, axis=1), stamp)
-            measured = displacement[valid] / self._pitch
+        displacement = displacement / self._pitch
+        measured = displacement[valid]
         if len(measured) < _FEWEST_MEASURED * markers:
             self._fit = None
             return None
         # The matrices are small: threads of the linear algebra would only wait for each other.
         with self._blas.limit(limits=1):
-            return self._estimate(displacement / self._pitch, valid, measured)
+            return self._estimate(displacement, valid, measured)
 
     def _estimate(self, displacement: Array, valid: NDArray[np.bool_], measured: Array) -> ForceEstimate:
-        mean_square = float((measured**2).mean())
+        mean_square = float(np.vdot(measured, measured)) / measured.size
         if mean_square < self._noise**2 * (1 + _CONTACT_SIGNIFICANCE / math.sqrt(measured.size / 2)):
             self._fit = None
             return self._no_contact()
@@ -127,37 +129,30 @@ class ForceEstimator:
         if not fit.normal.any():
             self._fit = None
             return self._no_contact()
-        return self._contact(fit, displacement, valid)
+        return self._contact(fit, measured.size)
 
-    def _contact(self, fit: ContactFit, displacement: Array, valid: NDArray[np.bool_]) -> ForceEstimate:
+    def _contact(self, fit: ContactFit, values: int) -> ForceEstimate:
+        """`values` is the number of measured values, two for each marker."""
         force = self.gel.youngs_modulus * self._pitch**2  # unit of the loads [N]
-        shear, normal = fit.shear(self._model.position), fit.normal
-        loads = np.concatenate([shear.ravel(), normal])
-        explained = (self._model.compliance @ loads).reshape(2, -1).T
-        left = np.linalg.norm((displacement - explained)[valid]) / np.linalg.norm(displacement[valid])
-        centre = normal @ self._positions / normal.sum()
-        arm = self._positions - centre
-        total = force * shear.sum(1)
-        pressed = float(force * normal.sum())
-        moment = float(force * (arm[:, 0] @ shear[1] - arm[:, 1] @ shear[0]))
-        spread = np.sqrt(np.diag(fit.rigid_covariance) * max(1.0, fit.cost / (2 * valid.sum())))
-        spread *= force * np.array([1.0, 1.0, 1.0, self._pitch])
+        sums, normal = fit.sums, fit.normal
+        total, pressed, moment = force * sums.shear, force * sums.normal, force * self._pitch * sums.moment
+        spread = force * np.sqrt(fit.rigid_covariance.diagonal() * max(1.0, fit.cost / values))
         modulus = self.gel.youngs_modulus_deviation
         return ForceEstimate(
             contact=True,
             shear=total,
             normal=pressed,
             moment=moment,
-            centre_of_pressure=centre,
+            centre_of_pressure=self._middle + self._pitch * sums.centre,
             contact_area=float((normal > _PRESSED * normal.max()).sum()) * self._pitch**2,
-            shear_deviation=np.sqrt(
-                spread[:2] ** 2 + (_SHEAR_ERROR * np.linalg.norm(total)) ** 2 + (modulus * total) ** 2
+            shear_deviation=np.array(
+                [math.hypot(spread[axis], _SHEAR_ERROR * math.hypot(*total), modulus * total[axis]) for axis in (0, 1)]
             ),
             normal_deviation=math.hypot(spread[2], _NORMAL_ERROR * pressed, modulus * pressed),
-            moment_deviation=math.hypot(spread[3], _MOMENT_ERROR * moment, modulus * moment),
-            shear_field=force * shear.T,
+            moment_deviation=math.hypot(self._pitch * spread[3], _MOMENT_ERROR * moment, modulus * moment),
+            shear_field=force * fit.shear(self._model.position).T,
             normal_field=force * normal,
-            unexplained=float(left),
+            unexplained=fit.unexplained,
         )
 
     def _no_contact(self) -> ForceEstimate:
@@ -169,7 +164,7 @@ class ForceEstimator:
         kappa = 3 - 4 * self.gel.poisson_ratio
         spreading = abs(1 - (1 - 2 * self.gel.poisson_ratio) * kappa) * 2 / (1 + kappa) ** 2
         n, cell, thickness = len(self._positions), self._pitch**2, self.gel.thickness
-        noise, arm = self._noise * self._pitch, self._positions - self._positions.mean(0)
+        noise, arm = self._noise * self._pitch, self._positions - self._middle
         stiffness = self.gel.youngs_modulus / (2 * (1 + self.gel.poisson_ratio)) * cell
         radius = math.sqrt(float((arm**2).sum()))
         shear = stiffness / thickness * noise * math.sqrt(n)

@@ -34,7 +34,8 @@ def test_every_public_name_is_listed_and_resolves(package: object, expected: set
 
 @pytest.mark.parametrize("package", ["gelflow.perception", "gelflow.perception.synthetic"])
 def test_importing_the_package_imports_no_heavy_dependency(package: str) -> None:
-    heavy = ("torch", "cv2", "mujoco", "matplotlib", "scipy", "gelflow.perception._tracker")
+    native = ("gelflow.perception._tracker", "gelflow.perception.force._contact_fit")
+    heavy = ("torch", "cv2", "mujoco", "matplotlib", "scipy", *native)
     code = f"import sys, {package}; print([name for name in {heavy} if name in sys.modules])"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import nnls
 
-from gelflow.perception.force.nonnegative import solve_nonnegative
+from gelflow.perception.force._contact_fit import solve_nonnegative
 
 
 @pytest.mark.parametrize("seed", range(8))
