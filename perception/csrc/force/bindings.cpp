@@ -93,10 +93,6 @@ struct SharedFitter {
     const std::lock_guard lock(mutex);
     return fit(fitter, image);
   }
-  void check(const ContactFit& fit) const {
-    if (fit.normal.size() != std::size_t(fitter.grid().cells))
-      throw std::invalid_argument("the last fit is that of another grid");
-  }
 };
 
 std::unique_ptr<SharedFitter> make_fitter(const Array<double>& position, const Array<double>& correlation,
@@ -140,6 +136,16 @@ ContactFit first(SharedFitter& shared, const HeldEquations& image, const Array<d
   const std::array<double, 2> middle{centre.at(0), centre.at(1)};
   return shared.run(image, [&](ContactFitter& fitter, const NormalEquations& equations) {
     return fitter.first(equations, pairs, of_normal, deviation, middle);
+  });
+}
+
+// A fit that starts from the last one: `ContactFitter::step` or `ContactFitter::follow`.
+template <ContactFit (ContactFitter::*improve)(const NormalEquations&, const ContactFit&)>
+ContactFit improved(SharedFitter& shared, const HeldEquations& image, const ContactFit& last) {
+  if (last.normal.size() != std::size_t(shared.fitter.grid().cells))
+    throw std::invalid_argument("the last fit is that of another grid");
+  return shared.run(image, [&](ContactFitter& fitter, const NormalEquations& equations) {
+    return (fitter.*improve)(equations, last);
   });
 }
 
@@ -216,23 +222,7 @@ PYBIND11_MODULE(_contact_fit, module) {
       .def("equations", &equations, py::arg("gram"), py::arg("displacement"), py::arg("valid"), py::arg("noise"))
       .def("first", &first, py::arg("image"), py::kw_only(), py::arg("ratios"), py::arg("scales"), py::arg("deviation"),
            py::arg("centre"))
-      .def(
-          "step",
-          [](SharedFitter& shared, const HeldEquations& image, const ContactFit& last) {
-            shared.check(last);
-            return shared.run(image, [&](ContactFitter& fitter, const NormalEquations& equations) {
-              return fitter.step(equations, last);
-            });
-          },
-          py::arg("image"), py::arg("last"))
-      .def(
-          "follow",
-          [](SharedFitter& shared, const HeldEquations& image, const ContactFit& last) {
-            shared.check(last);
-            return shared.run(image, [&](ContactFitter& fitter, const NormalEquations& equations) {
-              return fitter.follow(equations, last);
-            });
-          },
-          py::arg("image"), py::arg("last"));
+      .def("step", &improved<&ContactFitter::step>, py::arg("image"), py::arg("last"))
+      .def("follow", &improved<&ContactFitter::follow>, py::arg("image"), py::arg("last"));
   module.def("solve_nonnegative", &solve_nonnegative, py::arg("hessian"), py::arg("linear"), py::arg("start"));
 }

@@ -130,18 +130,24 @@ void ContactFitter::set_load_equations(const NormalEquations& image, double scal
   algebra_.transpose_multiply(-1.0, cross.columns(0, m), right, 1.0, linear_.data());
 }
 
+// T, and G times all loads and times T.
 void ContactFitter::set_responses(const NormalEquations& image) {
   const int m = int(cells_.size()), k = remainder_cells_;
-  const std::size_t n = std::size_t(grid_.cells), loads = 3 * n;
+  const std::size_t loads = 3 * std::size_t(grid_.cells);
+  const MatrixView shear = shear_.resize(2 * m, 3);
+  std::fill_n(shear.data, 2 * m * 3, 0.0);
   for (Values* response : {&response_, &response_x_, &response_y_, &response_turn_}) response->assign(loads, 0.0);
   for (int j = 0; j < m; ++j) {
     const std::size_t s = std::size_t(j);
-    const double p = solver_.solution()[s], turn_x = -arm_y_[s] * p, turn_y = arm_x_[s] * p;
+    const double p = solver_.solution()[s];
+    shear(j, 0) = shear(m + j, 1) = p;
+    shear(j, 2) = -arm_y_[s] * p, shear(m + j, 2) = arm_x_[s] * p;
     const double along = ratio_x_[s] * p + (j < k ? remainder_[s] : 0.0);
     const double across = ratio_y_[s] * p + (j < k ? remainder_[std::size_t(k + j)] : 0.0);
     const GramRows rows = image.rows(cell(j));
     add_response(rows, along, across, p, response_.data());
-    if (p > 0) add_motion(rows, p, turn_x, turn_y, response_x_.data(), response_y_.data(), response_turn_.data());
+    if (p > 0)
+      add_motion(rows, p, shear(j, 2), shear(m + j, 2), response_x_.data(), response_y_.data(), response_turn_.data());
   }
 }
 
@@ -161,15 +167,13 @@ void ContactFitter::set_gradient(const NormalEquations& image, ContactFit& fit) 
   }
 }
 
+// B from the responses.
 void ContactFitter::set_couplings(const NormalEquations& image) {
   const int m = int(cells_.size());
   const std::size_t n = std::size_t(grid_.cells);
-  const MatrixView coupling = coupling_.resize(3 * m, quantities), shear = shear_.resize(2 * m, 3);
+  const MatrixView coupling = coupling_.resize(3 * m, quantities);
   std::fill_n(coupling.data, 3 * m * quantities, 0.0);
-  std::fill_n(shear.data, 2 * m * 3, 0.0);
   for (int j = 0; j < m; ++j) {
-    const std::size_t s = std::size_t(j);
-    const double p = solver_.solution()[s];
     for (int axis = 0; axis < 3; ++axis) {
       const std::size_t load = std::size_t(axis) * n + cell(j);
       const int row = axis * m + j;
@@ -177,9 +181,7 @@ void ContactFitter::set_couplings(const NormalEquations& image) {
       coupling(row, 2) = image.weight * response_turn_[load];
       coupling(row, 3 + axis) = 1;
     }
-    coupling(j, 6) = -arm_y_[s], coupling(m + j, 6) = arm_x_[s];
-    shear(j, 0) = shear(m + j, 1) = p;
-    shear(j, 2) = -arm_y_[s] * p, shear(m + j, 2) = arm_x_[s] * p;
+    coupling(j, 6) = -arm_y_[std::size_t(j)], coupling(m + j, 6) = arm_x_[std::size_t(j)];
   }
 }
 
