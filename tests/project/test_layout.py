@@ -135,7 +135,9 @@ def test_a_wheel_contains_data_and_no_c_sources(tmp_path: Path) -> None:
     shutil.copytree(ROOT, tree, symlinks=True, ignore=skip)
     (tree / "sim" / "_core.stale.so").touch()  # leftovers of development must not be packaged
     command = [sys.executable, "-m", "pip", "wheel", "--no-index", "--no-deps", "--no-build-isolation", "-q"]
-    subprocess.run([*command, "-Cwheel.cmake=false", "-w", tmp_path, tree], check=True, capture_output=True)
+    subprocess.run(
+        [*command, "--config-settings=wheel.cmake=false", "-w", tmp_path, tree], check=True, capture_output=True
+    )
     (wheel,) = tmp_path.glob("gelflow-*.whl")
     with zipfile.ZipFile(wheel) as archive:
         held = {name.removeprefix("gelflow/") for name in archive.namelist()}
