@@ -181,19 +181,20 @@ GELFLOW_CLONES inline void accumulate(const Window& window, int width, int heigh
 using InverseHessian = std::array<double, 36>;
 
 // Inverts a symmetric positive definite matrix by Gauss-Jordan elimination; false when it is singular.
-inline bool invert(std::array<double, 36>& matrix, InverseHessian& inverse) {
+template <std::size_t n>
+bool invert(std::array<double, n * n>& matrix, std::array<double, n * n>& inverse) {
   inverse.fill(0);
-  for (int i = 0; i < 6; ++i) inverse[std::size_t(7 * i)] = 1;
-  for (std::size_t i = 0; i < 6; ++i) {
-    const double pivot = matrix[7 * i];
+  for (std::size_t i = 0; i < n; ++i) inverse[(n + 1) * i] = 1;
+  for (std::size_t i = 0; i < n; ++i) {
+    const double pivot = matrix[(n + 1) * i];
     if (!(pivot > 1e-9)) return false;
-    for (std::size_t j = 0; j < 6; ++j) matrix[6 * i + j] /= pivot, inverse[6 * i + j] /= pivot;
-    for (std::size_t k = 0; k < 6; ++k) {
-      const double factor = matrix[6 * k + i];
+    for (std::size_t j = 0; j < n; ++j) matrix[n * i + j] /= pivot, inverse[n * i + j] /= pivot;
+    for (std::size_t k = 0; k < n; ++k) {
+      const double factor = matrix[n * k + i];
       if (k == i || factor == 0) continue;
-      for (std::size_t j = 0; j < 6; ++j) {
-        matrix[6 * k + j] -= factor * matrix[6 * i + j];
-        inverse[6 * k + j] -= factor * inverse[6 * i + j];
+      for (std::size_t j = 0; j < n; ++j) {
+        matrix[n * k + j] -= factor * matrix[n * i + j];
+        inverse[n * k + j] -= factor * inverse[n * i + j];
       }
     }
   }
@@ -222,7 +223,7 @@ GELFLOW_CLONES inline bool inverse_hessian(const DotProfile& profile, const DotS
   std::array<double, 36> h;
   for (std::size_t i = 0; i < 6; ++i)
     for (std::size_t l = 0; l <= i; ++l) h[6 * i + l] = h[6 * l + i] = sum_lanes(sums[6 * i + l]);
-  return invert(h, inverse);
+  return invert<6>(h, inverse);
 }
 
 struct FitSettings {

@@ -7,7 +7,11 @@ namespace gelflow::perception {
 namespace {
 constexpr double min_quality = 0.35;  // of an accepted fit
 constexpr double min_quality_undetected =
-    0.55;  // of an accepted fit at an interpolated position without a detected dot
+    0.55;                                      // of an accepted fit at an interpolated position without a detected dot
+constexpr double uneven_light_quality = 0.92;  // quality / quality at rest below which a fit is improved by `EdgeFit`
+constexpr double largest_unexplained =
+    0.7;  // part of the edge that an accepted improvement may leave, relative to before
+constexpr double min_quality_improved = 0.6;
 constexpr double min_contrast_ratio = 0.35, max_contrast_ratio = 2.2;  // accepted contrast / contrast at rest
 constexpr double min_response_ratio = 0.3;  // minimum response of a dot / median response at rest
 constexpr double max_velocity = 0.25;       // in spacings per image; larger steps are jumps, without prediction
@@ -24,12 +28,20 @@ int window_size(double radius, double spacing) {
             most = int(0.85 * spacing / pack_size) * pack_size;
   return std::clamp(wanted, pack_size, std::clamp(most, pack_size, Window::largest));
 }
+double typical_contrast(std::vector<double> contrasts) {
+  if (contrasts.empty()) return -0.5;
+  const auto median = contrasts.begin() + std::ptrdiff_t(contrasts.size() / 2);
+  std::nth_element(contrasts.begin(), median, contrasts.end());
+  return *median;
+}
 }  // namespace
 
 Tracker::Tracker(TrackerSetup setup)
     : setup_(std::move(setup)),
       settings_{setup_.profile, window_size(setup_.radius, setup_.spacing), setup_.radius, setup_.noise},
       inverse_hessian_(setup_.rest.size()),
+      edge_fit_(setup_.profile, typical_contrast(setup_.contrast)),
+      rest_quality_(setup_.rest.size()),
       plane_(setup_.width, setup_.height),
       detector_(setup_.width, setup_.height, setup_.radius, setup_.spacing, setup_.bright),
       assignment_(setup_.grid, setup_.spacing) {
@@ -53,6 +65,7 @@ Tracker::Tracker(TrackerSetup setup)
 void Tracker::start(const std::uint8_t* bgr) {
   extract_plane(bgr, plane_, setup_.channel);
   shape_ = setup_.shape;
+  std::fill(rest_quality_.begin(), rest_quality_.end(), 0.0);
   anything_valid_ = false;
   for (std::size_t m = 0; m < setup_.rest.size(); ++m) {
     quality_[m] = 0;
@@ -67,6 +80,7 @@ void Tracker::start(const std::uint8_t* bgr) {
     anything_valid_ = true;
   }
   positions_ = setup_.rest;
+  rest_quality_ = quality_;
   rest_images_ = 1;
   std::fill(velocity_.begin(), velocity_.end(), Point{});
   detector_.detect(plane_, 0.0f, 4 * setup_.rest.size() + 64, dots_);
@@ -204,8 +218,18 @@ DotFit Tracker::fit(std::size_t marker, Point position, int iterations) const {
   if (!(position.x > -setup_.radius && position.y > -setup_.radius && position.x < setup_.width + setup_.radius &&
         position.y < setup_.height + setup_.radius))
     return {position, 0, 0};
-  return fit_dot(plane_, settings_, shape_[marker], mask(marker), inverse_hessian_[marker], setup_.contrast[marker],
-                 setup_.tolerated[marker], position, iterations);
+  const DotFit found = fit_dot(plane_, settings_, shape_[marker], mask(marker), inverse_hessian_[marker],
+                               setup_.contrast[marker], setup_.tolerated[marker], position, iterations);
+  if (!(found.quality > 0) || found.quality > uneven_light_quality * rest_quality_[marker]) return found;
+  DotFit improved =
+      edge_fit_.improve(plane_, shape_[marker], mask(marker), setup_.noise, setup_.tolerated[marker], found);
+  const double ratio = improved.contrast / setup_.contrast[marker];
+  const bool explains_more = 1 - improved.quality < largest_unexplained * (1 - found.quality);
+  if (!explains_more || improved.quality < min_quality_improved || ratio < min_contrast_ratio ||
+      ratio > max_contrast_ratio || squared(improved.position - found.position) > squared({setup_.radius, 0}))
+    return found;
+  improved.quality = found.quality;  // comparisons with the neighbours stay as strict as without the improvement
+  return improved;
 }
 
 // Quality of a fit, 0 if the image border cuts the dot or its contrast differs too much from that at rest.

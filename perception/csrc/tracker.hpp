@@ -3,6 +3,7 @@
 
 #include "assignment.hpp"
 #include "dot_fit.hpp"
+#include "edge_fit.hpp"
 
 namespace gelflow::perception {
 
@@ -61,7 +62,9 @@ class Tracker {
   TrackerSetup setup_;
   FitSettings settings_;
   std::vector<InverseHessian> inverse_hessian_;
-  std::vector<DotShape> shape_;  // of the dots on the deformed gel
+  EdgeFit edge_fit_;
+  std::vector<double> rest_quality_;  // of the fits at rest
+  std::vector<DotShape> shape_;       // of the dots on the deformed gel
   Plane plane_;
   DotDetector detector_;
   DotAssignment assignment_;
