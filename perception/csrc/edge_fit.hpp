@@ -1,14 +1,16 @@
 // Fit of the centre of a dot by its edge, in light that changes over the dot.
 //
 // Under a contact, wrinkles, shadows and reflections change the brightness within a fraction of a dot. The linear
-// background of dot_fit.hpp follows them so badly that the centre moves. Near the edge, a background with more freedom
-// can be fitted, since the profile changes there over a much shorter distance than the light:
+// background of dot_fit.hpp cannot follow them, and the residuals shift the centre. Near the edge, a background with more
+// unknowns is still determined by the image, because the profile changes there over a much shorter distance than the
+// light:
 //
 //   m(ρ, φ) = b (1 + Σ c_k cos kφ + d_k sin kφ) (1 + a s(ρ)),   c_k, d_k linear in ρ,
 //
-// in polar coordinates of the dot, with ρ = 1 on its outline, in a ring around it. The price is a larger effect of
-// noise, so the fit serves where the one of dot_fit.hpp explains the edge less than at rest. The image is sampled at the
-// points of a polar grid that moves with the dot, so that the Jacobian is the same for all dots and positions.
+// in polar coordinates of the dot, with ρ = 1 on its outline, within a ring around the outline. Noise has a larger effect
+// on this fit, so the tracker uses it only where the fit of dot_fit.hpp explains the edge less than at rest. The image is
+// sampled at the points of a polar grid that moves with the dot, so that the Jacobian is the same for all dots and
+// positions.
 #pragma once
 
 #include <numbers>
@@ -50,13 +52,13 @@ class EdgeFit {
     is_valid_ = invert<unknowns>(hessian, inverse_);
   }
 
-  // Improves the fit of a dot; arguments as in `fit_dot`. Where the edge does not determine the centre, the quality of
-  // the result is 0.
+  // Improves the fit `begin` of a dot; the other arguments are those of `fit_dot`. The quality of the result is 0 where
+  // the fit diverges.
   DotFit improve(const Plane& plane, const DotShape& shape, const DotMask* mask, double noise, double tolerated,
                  const DotFit& begin) const {
     if (!is_valid_) return {begin.position, begin.contrast, 0};
     Samples samples;
-    place(shape, mask, samples);
+    place_points(shape, mask, samples);
     std::array<double, terms> light{};
     float x = float(begin.position.x), y = float(begin.position.y), a = float(begin.contrast);
     Sums sums;
@@ -95,9 +97,9 @@ class EdgeFit {
   using Values = std::array<float, points>;
 
   struct Samples {
-    alignas(32) Values right, down;  // from the centre [px]
-    alignas(32) Values described;    // the mask
-    alignas(32) Values pixel, inside;
+    alignas(32) Values right, down;    // from the centre [px]
+    alignas(32) Values mask;           // weight of the points by `DotMask`
+    alignas(32) Values pixel, inside;  // grey levels, and the mask of the points inside the image
   };
   struct Sums {
     std::array<double, unknowns> gradient;
@@ -105,7 +107,7 @@ class EdgeFit {
   };
 
   // Positions of the points relative to the centre: ρ = |d| (1 − e₄) − e₃ with the waves e of the outline.
-  void place(const DotShape& shape, const DotMask* mask, Samples& samples) const {
+  void place_points(const DotShape& shape, const DotMask* mask, Samples& samples) const {
     const float area = shape.xx * shape.yy - shape.xy * shape.yx;
     for (int p = 0; p < points; ++p) {
       const float c = cos_[p], s = sin_[p], c2 = c * c - s * s, s2 = 2 * c * s;
@@ -114,8 +116,8 @@ class EdgeFit {
       const float distance = (radius_[p] + third) / (1 - fourth), u = distance * c, v = distance * s;
       samples.right[p] = (shape.yy * u - shape.xy * v) / area;
       samples.down[p] = (shape.xx * v - shape.yx * u) / area;
-      samples.described[p] = 1;
-      if (mask) samples.described[p] = sample_mask(*mask, FloatPack{} + u, FloatPack{} + v)[0];
+      samples.mask[p] = 1;
+      if (mask) samples.mask[p] = sample_mask(*mask, FloatPack{} + u, FloatPack{} + v)[0];
     }
   }
 
@@ -123,7 +125,7 @@ class EdgeFit {
     for (int p = 0; p < points; ++p) {
       const float right = x + samples.right[p], down = y + samples.down[p];
       const bool inside = right >= 0 && down >= 0 && right < float(plane.width - 1) && down < float(plane.height - 1);
-      samples.inside[p] = inside ? samples.described[p] : 0;
+      samples.inside[p] = inside ? samples.mask[p] : 0;
       const int column = inside ? int(right) : 0, line = inside ? int(down) : 0;
       const float across = right - float(column), along = down - float(line);
       const std::uint8_t* first = plane.row(line) + column;
@@ -158,9 +160,10 @@ class EdgeFit {
       for (std::size_t i = 0; i < terms; ++i) basis[i] = load(background_[i], p), model += float(light[i]) * basis[i];
       const FloatPack s = load(profile_, p), slope = load(slope_, p), inside = load(samples.inside, p);
       const FloatPack ink = 1 + a * s, r = load(samples.pixel, p) - model * ink;
-      const FloatPack w = inside / (1 + r * r * k2), psi = w * r * inverse, lit = psi * ink, tilt = psi * slope;
-      total[0] += tilt * load(cos_, p), total[1] += tilt * load(sin_, p), total[2] += psi * s;
-      for (std::size_t i = 0; i < terms; ++i) total[3 + i] += lit * basis[i];
+      const FloatPack w = inside / (1 + r * r * k2), psi = w * r * inverse, psi_ink = psi * ink,
+                      psi_slope = psi * slope;
+      total[0] += psi_slope * load(cos_, p), total[1] += psi_slope * load(sin_, p), total[2] += psi * s;
+      for (std::size_t i = 0; i < terms; ++i) total[3 + i] += psi_ink * basis[i];
       weight += w, masked += inside, edge += inside * slope * slope,
           edge_weighted += inside * slope * slope / (1 + r * r * (k2 * scale_factor * scale_factor));
     }
