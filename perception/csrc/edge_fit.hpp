@@ -121,7 +121,7 @@ class EdgeFit {
     }
   }
 
-  static void sample(const Plane& plane, float x, float y, Samples& samples) {
+  GELFLOW_CLONES static void sample(const Plane& plane, float x, float y, Samples& samples) {
     for (int p = 0; p < points; ++p) {
       const float right = x + samples.right[p], down = y + samples.down[p];
       const bool inside = right >= 0 && down >= 0 && right < float(plane.width - 1) && down < float(plane.height - 1);
@@ -145,7 +145,8 @@ class EdgeFit {
     return std::max(sum / weight, 4.0);
   }
 
-  void accumulate(const Samples& samples, const std::array<double, terms>& light, float a, float k, Sums& sums) const {
+  GELFLOW_CLONES void accumulate(const Samples& samples, const std::array<double, terms>& light, float a, float k,
+                                 Sums& sums) const {
     const float b = float(std::max(light[0], 1.0)), inverse = 1 / b, k2 = 1 / (k * k);
     std::array<FloatPack, unknowns> total{};
     FloatPack weight{}, masked{}, edge{}, edge_weighted{};

@@ -29,7 +29,7 @@ def recorded_pad(path: str, sensor: str) -> RecordedPad | None:
             described: Mapping[str, Any] = session.description()
     except PeerError:  # no description, or damage, which the reader of the images states
         return None
-    number, mounts = SENSORS.index(sensor), described.get("mounts", ())
+    number, mounts = SENSORS.index(sensor), described.get("mounts") or ()
     if number >= len(mounts):
         return None
     gel = (described.get("gels") or [None] * len(SENSORS))[number]

@@ -11,7 +11,7 @@ from gelflow.protocols import Policy
 from gelflow.session.decision_replay import Comparison, PerceptionPipeline, replay
 from gelflow.session.messages import Damage
 from gelflow.session.reader import SessionReader
-from gelflow.session.records import file_digest, from_plain
+from gelflow.session.records import described, file_digest
 from gelflow.task import InsertionTask
 
 
@@ -45,13 +45,15 @@ def _recorded_perception(description: Mapping[str, Any]) -> tuple[InsertionTask,
 
     try:
         task = InsertionTask.from_json(dict(description["task"]))
-        mounts = [from_plain(CameraMount, mount, what="camera mount") for mount in description["mounts"]]
-        configs = [from_plain(TrackerConfig, config, what="tracker settings") for config in description["trackers"]]
+        mounts = described(CameraMount, description, "mounts", what="camera mount")
+        configs = described(TrackerConfig, description, "trackers", what="tracker settings")
     except KeyError as error:
         raise PeerError(
             f"the session's description lacks {error}: it is not that of a run; a recording of gelflow track, for "
             "example, has no decisions. Record your own with describe_session"
         ) from error
+    except TypeError as error:  # a value of another type, in a session that another program wrote
+        raise PeerError(f"the session's description is invalid: {error}; expected that of describe_session") from error
     if not len(mounts) == len(configs) == task.sensors:
         raise PeerError(
             f"the session describes {len(mounts)} camera mounts and {len(configs)} trackers; its task has "

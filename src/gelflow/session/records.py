@@ -84,6 +84,14 @@ def from_plain(kind: type[Record], data: Any, *, what: str) -> Record:
         raise UsageError(f"{what}: {error}") from error
 
 
+def described(kind: type[Record], description: Mapping[str, Any], key: str, *, what: str) -> list[Record]:
+    """The dataclasses of a list in the description of a session. Raises KeyError without it, UsageError as `from_plain`."""
+    listed = description[key]
+    if not isinstance(listed, Sequence) or isinstance(listed, str):
+        raise UsageError(f"the session's description: {key} must be a list, got {listed!r}")
+    return [from_plain(kind, one, what=what) for one in listed]
+
+
 def _field(wanted: Any, value: Any, what: str) -> Any:
     if typing.get_origin(wanted) is np.ndarray:
         return np.asarray(value)
@@ -188,7 +196,15 @@ def software_versions() -> dict[str, str]:
             versions[package] = metadata.version(package)
         except metadata.PackageNotFoundError:
             continue
-    return versions
+    return versions | _blas()
+
+
+def _blas() -> dict[str, str]:
+    """The matrix library of NumPy and the processor that it computes for: another one rounds differently."""
+    from threadpoolctl import threadpool_info
+
+    found = [one for one in threadpool_info() if one["user_api"] == "blas"]
+    return {"blas": ", ".join(sorted({f"{one['internal_api']} {one.get('architecture', '')}".strip() for one in found}))}
 
 
 def describe_session(

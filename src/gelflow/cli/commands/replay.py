@@ -21,7 +21,7 @@ from gelflow.real.camera.latency import LatencyEstimate, combine_latencies
 from gelflow.session.decision_replay import Comparison
 from gelflow.session.messages import Damage
 from gelflow.session.reader import SessionReader
-from gelflow.session.records import SENSORS, file_digest, from_plain, software_versions
+from gelflow.session.records import SENSORS, described, file_digest, software_versions
 
 _FORMER_VERSIONS = {"tracker": "1"}  # of sessions that do not state them
 
@@ -124,7 +124,7 @@ def _latencies(session: SessionReader, description: Mapping[str, Any]) -> list[l
     from gelflow.perception.tracker import TrackerConfig
     from gelflow.real.runner.session_latency import session_latencies
 
-    configs = [from_plain(TrackerConfig, config, what="tracker settings") for config in description["trackers"]]
+    configs = described(TrackerConfig, description, "trackers", what="tracker settings")
     return session_latencies(session, configs)
 
 

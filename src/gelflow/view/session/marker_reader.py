@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from gelflow.errors import GelflowError, PeerError, UsageError
 from gelflow.perception.frames import CameraMount, decode_image, tactile_frame
 from gelflow.perception.tracker import MarkerTracker, TrackerConfig, TrackingResult
-from gelflow.session.records import SENSORS, from_plain
+from gelflow.session.records import SENSORS, described
 from gelflow.session.time_index import TimeIndex
 from gelflow.view.session.moment import PadImage
 
@@ -37,9 +37,10 @@ class MarkerReader:
         self._configs: list[TrackerConfig] = []
         self._mounts: list[CameraMount] = []
         try:
-            trackers, mounts = description.get("trackers", ()), description.get("mounts", ())
-            self._mounts = [from_plain(CameraMount, mount, what="camera mount") for mount in mounts]
-            self._configs = [from_plain(TrackerConfig, config, what="tracker settings") for config in trackers]
+            if "mounts" in description:
+                self._mounts = described(CameraMount, description, "mounts", what="camera mount")
+            if "trackers" in description:
+                self._configs = described(TrackerConfig, description, "trackers", what="tracker settings")
         except UsageError as error:
             self.problem = str(error)
         self._trackers: dict[int, MarkerTracker | str] = {}
