@@ -148,6 +148,17 @@ def test_a_session_of_a_former_tracker_is_named(
     assert "recorded with tracker 1, installed is 99" in replay._notes({"versions": {}}, None)
 
 
+def test_a_session_of_another_processor_is_named(
+    real_session: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with SessionReader(real_session) as session:
+        recorded = session.description()["versions"]["blas"]
+    assert recorded
+    monkeypatch.setattr(replay, "software_versions", lambda: records.software_versions() | {"blas": "openblas Z80"})
+    assert main(["replay", str(real_session)]) == 0
+    assert f"recorded with blas {recorded}, installed is openblas Z80" in " ".join(capsys.readouterr().out.split())
+
+
 def test_a_session_finds_its_policy_among_those_shipped(
     real_session: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -294,6 +305,10 @@ def test_the_command_rejects_wrong_input_with_one_line(
     with SessionRecorder(tmp_path / "one.mcap", CLOCK) as recorder:
         described = describe_session(task=INSERTION, trackers=[{}] * 2, mounts=[{}] * 2, checkpoint=None)
         recorder.metadata({**described, "trackers": [{}]})
+    for key in ("task", "mounts", "trackers"):
+        with SessionRecorder(tmp_path / f"no-{key}.mcap", CLOCK) as recorder:
+            described = describe_session(task=INSERTION, trackers=[{}] * 2, mounts=[{}] * 2, checkpoint=None)
+            recorder.metadata({**described, key: None})
     mine = tmp_path / "mine.png"
     mine.write_bytes(b"mine")
     for arguments, message in [
@@ -304,6 +319,9 @@ def test_the_command_rejects_wrong_input_with_one_line(
         ([str(tmp_path / "bare.mcap")], "lacks 'task'"),
         ([str(tmp_path / "one.mcap")], "2 camera mounts and 1 trackers; its task has 2 sensors"),
         ([str(tmp_path / "odd.mcap")], "unknown keys ['lens']"),
+        ([str(tmp_path / "no-task.mcap")], "the session's description is invalid"),
+        ([str(tmp_path / "no-mounts.mcap")], "mounts must be a list, got None"),
+        ([str(tmp_path / "no-trackers.mcap")], "trackers must be a list, got None"),
         ([str(real_session), "--checkpoint", str(cut)], "checkpoint"),
         ([str(real_session), "--out", str(tmp_path / "no folder" / "a.png")], "no folder does not exist"),
         ([str(real_session), "--out", str(tmp_path / "a.foo")], "a.foo: the suffix must be one of .png"),

@@ -141,6 +141,7 @@ def read_mechanics(path: Path) -> Mechanics:
         raise UsageError(f"{path}: the model has no joint, so nothing can move; add a joint, or a free joint to a body")
     apply_disable_flags(model)
     check_supported(model, path.name)
+    _check_finite(model, path.name)
     moving_body, poses = _merge(model)
     actuators = read_actuators(model, path.name)
     tendons = read_tendons(model, actuators)
@@ -167,6 +168,25 @@ def read_mechanics(path: Path) -> Mechanics:
         step=float(model.opt.timestep),
         not_modelled=not_modelled(model),
     )
+
+
+def _check_finite(model: Any, location: str) -> None:
+    """Raise UsageError if a number that MuJoCo does not check is not finite."""
+    numbers = {
+        "gravity": model.opt.gravity,
+        "a body's mass": model.body_mass,
+        **{f"a joint's {name}": getattr(model, f"dof_{name}") for name in ("damping", "armature", "frictionloss")},
+        "a joint's stiffness": model.jnt_stiffness,
+        "a joint's springref": model.qpos_spring,
+        "an actuator's gear": model.actuator_gear,
+        "an actuator's gain": model.actuator_gainprm,
+        "an actuator's bias": model.actuator_biasprm,
+        **{f"a tendon's {name}": getattr(model, f"tendon_{name}") for name in ("stiffness", "damping", "frictionloss")},
+        "an equality constraint": model.eq_data,
+    }
+    for name, values in numbers.items():
+        if not np.isfinite(values).all():
+            raise UsageError(f"{location}: {name} has an entry that is not finite")
 
 
 def _merge(model: Any) -> tuple[NDArray[np.int64], list[Pose]]:

@@ -85,7 +85,10 @@ def from_plain(kind: type[Record], data: Any, *, what: str) -> Record:
 
 
 def described(kind: type[Record], description: Mapping[str, Any], key: str, *, what: str) -> list[Record]:
-    """The dataclasses of a list in the description of a session. Raises KeyError without it, UsageError as `from_plain`."""
+    """The dataclasses of a list in the description of a session.
+
+    Raises KeyError without the list, UsageError as `from_plain`.
+    """
     listed = description[key]
     if not isinstance(listed, Sequence) or isinstance(listed, str):
         raise UsageError(f"the session's description: {key} must be a list, got {listed!r}")
@@ -204,7 +207,8 @@ def _blas() -> dict[str, str]:
     from threadpoolctl import threadpool_info
 
     found = [one for one in threadpool_info() if one["user_api"] == "blas"]
-    return {"blas": ", ".join(sorted({f"{one['internal_api']} {one.get('architecture', '')}".strip() for one in found}))}
+    names = {f"{one['internal_api']} {one.get('architecture', '')}".strip() for one in found}
+    return {"blas": ", ".join(sorted(names))}
 
 
 def describe_session(

@@ -264,3 +264,20 @@ def test_sampled_mesh_needs_a_count(tmp_path: Path) -> None:
     text = MODEL.replace("<worldbody>", mesh).replace('name="ball" size="0.1"', 'name="ball" type="mesh" mesh="m"')
     (tmp_path / "robot.xml").write_text(text)
     check_error(tmp_path, "robot.xml", "points.p: count is missing", '[points.p]\ngeom = "ball"\n')
+
+
+@pytest.mark.parametrize(
+    ("change", "name"),
+    [
+        (option('gravity="0 0 nan"/>'), "gravity"),
+        (swing('damping="nan"'), "a joint's damping"),
+        (swing('stiffness="inf"'), "a joint's stiffness"),
+        (swing('springref="nan" stiffness="1"'), "a joint's springref"),
+        (actuator('<motor name="push" joint="swing" gear="nan"/>'), "an actuator's gear"),
+        (('name="ball" size="0.1"', 'name="ball" size="0.1" mass="inf"'), "a body's mass"),
+        (section('<tendon><fixed stiffness="nan"><joint joint="swing" coef="1"/></fixed></tendon>'), "a tendon's stiff"),
+    ],
+)
+def test_a_number_that_is_not_finite_is_an_error(change: tuple[str, str], name: str, tmp_path: Path) -> None:
+    (tmp_path / "robot.xml").write_text(MODEL.replace(*change, 1))
+    check_error(tmp_path, "robot.xml", f"{name} has an entry that is not finite")

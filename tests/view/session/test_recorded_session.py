@@ -201,13 +201,13 @@ def test_links_of_the_arm_follow_each_other() -> None:
         assert np.linalg.norm(np.subtract(frames[1][0], frames[0][0])) == pytest.approx(0.27)
 
 
-def test_what_a_session_lacks_is_stated_and_the_rest_is_shown(tmp_path: Path) -> None:
+@pytest.mark.parametrize("mounts", [[{}] * 2, None])
+def test_what_a_session_lacks_is_stated_and_the_rest_is_shown(tmp_path: Path, mounts: list[dict[str, float]]) -> None:
     clock = ManualClock(5.0)
     path = tmp_path / "poor.mcap"
     with SessionRecorder(path, clock) as recorder:
-        recorder.metadata(
-            describe_session(task=INSERTION, trackers=[{"lines": 3}] * 2, mounts=[{}] * 2, lab={"arm": {}})
-        )
+        described = describe_session(task=INSERTION, trackers=[{"lines": 3}] * 2, mounts=[{}] * 2, lab={"arm": {}})
+        recorder.metadata({**described, "mounts": mounts})
         recorder.image(0, CameraImage(b"\xff\xd8no picture\xff\xd9", 5.0, 0))
         clock.time = 6.0
         recorder.event("stopped", {"reason": "test"})
