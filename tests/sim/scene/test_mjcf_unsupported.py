@@ -275,7 +275,10 @@ def test_sampled_mesh_needs_a_count(tmp_path: Path) -> None:
         (swing('springref="nan" stiffness="1"'), "a joint's springref"),
         (actuator('<motor name="push" joint="swing" gear="nan"/>'), "an actuator's gear"),
         (('name="ball" size="0.1"', 'name="ball" size="0.1" mass="inf"'), "a body's mass"),
-        (section('<tendon><fixed stiffness="nan"><joint joint="swing" coef="1"/></fixed></tendon>'), "a tendon's stiff"),
+        (
+            section('<tendon><fixed stiffness="nan"><joint joint="swing" coef="1"/></fixed></tendon>'),
+            "a tendon's stiffness",
+        ),
     ],
 )
 def test_a_number_that_is_not_finite_is_an_error(change: tuple[str, str], name: str, tmp_path: Path) -> None:
