@@ -148,7 +148,7 @@ def _notes(description: Mapping[str, Any], checkpoint: Path | None) -> list[str]
     if checkpoint and recorded and file_digest(checkpoint) != recorded["digest"]:
         notes.append(f"{checkpoint} is not the policy that the session ran")
     installed = software_versions()
-    for name, version in (_FORMER_VERSIONS | description.get("versions", {})).items():
+    for name, version in (_FORMER_VERSIONS | (description.get("versions") or {})).items():
         if installed.get(name) != version:
             notes.append(f"recorded with {name} {version}, installed is {installed.get(name, 'none')}")
     return notes
