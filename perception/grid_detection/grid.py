@@ -36,6 +36,7 @@ _MAX_DOTS = 2500  # weaker dots are texture
 _MAX_BETWEEN = 0.4  # limit of (dots between the rows and columns) / (dots of the grid)
 _MAX_IRREGULARITY = 0.12  # limit of `Lattice.irregularity`
 _MAX_AREA = 2.2  # of a dot / median; larger ones are joined dots
+_CLEARLY_BETTER = 1.05  # score of a grid / score in an earlier image plane, which has less noise if they are alike
 
 
 @dataclass(frozen=True)
@@ -222,7 +223,7 @@ def _search(
             if lattice is None or lattice.irregularity > _MAX_IRREGULARITY or _are_gaps(response, dots, lattice):
                 continue
             score, certain = _score(response, dots, lattice)
-            if score > best_score:
+            if score > best_score * (1 if best is None or best[0] == appearance else _CLEARLY_BETTER):
                 best, best_score = (appearance, _dot_radius(dots, lattice), lattice.spacing), score
             if certain:
                 return best
