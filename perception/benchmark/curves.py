@@ -111,7 +111,7 @@ def draw(results: Sequence[Mapping[str, Any]], file: Path) -> None:
         else:
             _draw_errors(axes, points)
     handles, labels = figure.axes[0].get_legend_handles_labels()
-    legend = "solid: median; dashed: 95th percentile; cross: the grid is not found"
+    legend = "solid: median; dashed: 95th percentile; cross: a grid is not found"
     figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), title=legend)
     figure.suptitle(_title(results), fontsize=11)
     save(figure, file, dpi=90)
@@ -137,7 +137,7 @@ def _draw_errors(axes: Any, points: Sequence[Mapping[str, Any]]) -> None:
         for metric, style, fill, label in (("median", "-", color, name), ("percentile_95", "--", "white", None)):
             measured = [(p["value"], p[name][metric]) for p in points if p[name][metric] is not None]
             axes.plot(*zip(*measured, strict=True), marker + style, color=color, mfc=fill, label=label, ms=4)
-        failed = [p["value"] for p in points if p[name]["median"] is None]
+        failed = [p["value"] for p in points if p[name]["failed"]]
         axes.plot(failed, [0.04] * len(failed), "x", color=color, ms=8, mew=2, transform=axes.get_xaxis_transform())
 
 
