@@ -1,5 +1,6 @@
 """Insertion runner against the mock robot over pty, TCP, UDP and HTTP: insertions, lost parts, invalid actions."""
 
+import re
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -107,9 +108,9 @@ def test_part_that_moves_in_the_grip_is_raised_and_handed_back(
 
     monkeypatch.setattr(robot.cell, "gripper_state", with_wider_grip)
     results = run_insertions(plan_for(robot, tmp_path, OraclePolicy(robot, answer=moved.set)))
-    assert [result.outcome for result in results] == [
-        "the grip width changed by +0.70 mm since the grasp: the part moved"
-    ]
+    (result,) = results
+    found = re.fullmatch(r"the grip width changed by \+(.*) mm since the grasp: the part moved", result.outcome)
+    assert found and float(found[1]) == pytest.approx(0.7, abs=0.02)  # the width itself varies by about 0.01 mm
     assert phases_of_moves_with_a_part(tmp_path / "session.mcap") >= {"descend", "retreat"}
     assert robot.cell.truth()["part"] is None or robot.cell.truth()["part"]["phase"] != "gripped"
 
