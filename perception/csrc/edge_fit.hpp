@@ -76,8 +76,7 @@ class EdgeFit {
       // The step of the centre is in the frame of the dot.
       const float u = float(std::clamp(step[0], -largest_step, largest_step));
       const float v = float(std::clamp(step[1], -largest_step, largest_step));
-      const float area = shape.xx * shape.yy - shape.xy * shape.yx;
-      const float right = (shape.yy * u - shape.xy * v) / area, down = (shape.xx * v - shape.yx * u) / area;
+      const auto [right, down] = to_image(shape, u, v);
       x += right, y += down, a += float(std::clamp(step[2], -0.1, 0.1));
       for (std::size_t i = 0; i < terms; ++i) light[i] += b * step[3 + i];
       if (!(a * begin.contrast > 0) || !std::isfinite(x + y)) return {begin.position, begin.contrast, 0};
@@ -106,18 +105,33 @@ class EdgeFit {
     double weight, mask, edge, edge_weighted;
   };
 
+  GELFLOW_INLINE static FloatPack load(const Values& values, int p) {
+    FloatPack pack;
+    std::memcpy(&pack, &values[std::size_t(p)], sizeof pack);
+    return pack;
+  }
+  GELFLOW_INLINE static void store(FloatPack pack, Values& values, int p) {
+    std::memcpy(&values[std::size_t(p)], &pack, sizeof pack);
+  }
+
+  // The offset (right, down) [px] of (u, v) in the frame of the dot.
+  template <class Number>
+  GELFLOW_INLINE static std::array<Number, 2> to_image(const DotShape& shape, Number u, Number v) {
+    const float area = shape.xx * shape.yy - shape.xy * shape.yx;
+    return {(shape.yy * u - shape.xy * v) / area, (shape.xx * v - shape.yx * u) / area};
+  }
+
   // Positions of the points relative to the centre: ρ = |d| (1 − e₄) − e₃ with the waves e of the outline.
   void place_points(const DotShape& shape, const DotMask* mask, Samples& samples) const {
-    const float area = shape.xx * shape.yy - shape.xy * shape.yx;
-    for (int p = 0; p < points; ++p) {
-      const float c = cos_[p], s = sin_[p], c2 = c * c - s * s, s2 = 2 * c * s;
-      const float third = shape.waves[0] * (c * c2 - s * s2) + shape.waves[1] * (c * s2 + s * c2);
-      const float fourth = shape.waves[2] * (c2 * c2 - s2 * s2) + shape.waves[3] * (2 * c2 * s2);
-      const float distance = (radius_[p] + third) / (1 - fourth), u = distance * c, v = distance * s;
-      samples.right[p] = (shape.yy * u - shape.xy * v) / area;
-      samples.down[p] = (shape.xx * v - shape.yx * u) / area;
-      samples.mask[p] = 1;
-      if (mask) samples.mask[p] = sample_mask(*mask, FloatPack{} + u, FloatPack{} + v)[0];
+    const auto& w = shape.waves;
+    const FloatPack one = FloatPack{} + 1;
+    for (int p = 0; p < points; p += pack_size) {
+      const FloatPack c = load(cos_, p), s = load(sin_, p);
+      const FloatPack third = bulge({w[0], w[1], 0, 0}, c, s, one), fourth = bulge({0, 0, w[2], w[3]}, c, s, one);
+      const FloatPack distance = (load(radius_, p) + third) / (1 - fourth), u = distance * c, v = distance * s;
+      const auto [right, down] = to_image(shape, u, v);
+      store(right, samples.right, p), store(down, samples.down, p);
+      store(mask ? sample_mask(*mask, u, v) : one, samples.mask, p);
     }
   }
 
@@ -150,11 +164,6 @@ class EdgeFit {
     const float b = float(std::max(light[0], 1.0)), inverse = 1 / b, k2 = 1 / (k * k);
     std::array<FloatPack, unknowns> total{};
     FloatPack weight{}, masked{}, edge{}, edge_weighted{};
-    const auto load = [](const Values& values, int p) {
-      FloatPack pack;
-      std::memcpy(&pack, &values[std::size_t(p)], sizeof pack);
-      return pack;
-    };
     for (int p = 0; p < points; p += pack_size) {
       std::array<FloatPack, terms> basis;
       FloatPack model{};

@@ -28,11 +28,13 @@ int window_size(double radius, double spacing) {
             most = int(0.85 * spacing / pack_size) * pack_size;
   return std::clamp(wanted, pack_size, std::clamp(most, pack_size, Window::largest));
 }
-double typical_contrast(std::vector<double> contrasts) {
-  if (contrasts.empty()) return -0.5;
-  const auto median = contrasts.begin() + std::ptrdiff_t(contrasts.size() / 2);
-  std::nth_element(contrasts.begin(), median, contrasts.end());
-  return *median;
+// 0 without values.
+template <class Number>
+Number median(std::vector<Number> values) {
+  if (values.empty()) return 0;
+  const auto middle = values.begin() + std::ptrdiff_t(values.size() / 2);
+  std::nth_element(values.begin(), middle, values.end());
+  return *middle;
 }
 }  // namespace
 
@@ -40,7 +42,7 @@ Tracker::Tracker(TrackerSetup setup)
     : setup_(std::move(setup)),
       settings_{setup_.profile, window_size(setup_.radius, setup_.spacing), setup_.radius, setup_.noise},
       inverse_hessian_(setup_.rest.size()),
-      edge_fit_(setup_.profile, typical_contrast(setup_.contrast)),
+      edge_fit_(setup_.profile, median(setup_.contrast)),
       rest_quality_(setup_.rest.size()),
       plane_(setup_.width, setup_.height),
       detector_(setup_.width, setup_.height, setup_.radius, setup_.spacing, setup_.bright),
@@ -93,9 +95,7 @@ void Tracker::start(const std::uint8_t* bgr) {
         detection_offset_[m] = setup_.rest[m] - dot.position;
       }
   if (responses.empty()) return;
-  const auto median = responses.begin() + std::ptrdiff_t(responses.size() / 2);
-  std::nth_element(responses.begin(), median, responses.end());
-  threshold_ = float(min_response_ratio) * *median;
+  threshold_ = float(min_response_ratio) * median(std::move(responses));
 }
 
 void Tracker::track(const std::uint8_t* bgr) {

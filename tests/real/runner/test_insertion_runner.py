@@ -1,6 +1,5 @@
 """Insertion runner against the mock robot over pty, TCP, UDP and HTTP: insertions, lost parts, invalid actions."""
 
-import re
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -101,16 +100,21 @@ def test_part_that_moves_in_the_grip_is_raised_and_handed_back(
 ) -> None:
     """The gripper still reports it: the pads are observed until it is released, and the next insertion starts."""
     measured, moved = robot.cell.gripper_state, threading.Event()
+    at_grasp: list[float] = []  # the width then: under load, the width of a grip varies by about 0.01 mm
 
     def with_wider_grip() -> tuple[float, float, float]:
         width, speed, force = measured()
-        return width + (0.7e-3 if moved.is_set() and width < 0.055 else 0.0), speed, force
+        part = robot.cell.truth()["part"]
+        if part is None or part["phase"] != "gripped":
+            return width, speed, force
+        at_grasp.append(width)
+        return at_grasp[0] + (0.7e-3 if moved.is_set() else 0.0), speed, force
 
     monkeypatch.setattr(robot.cell, "gripper_state", with_wider_grip)
     results = run_insertions(plan_for(robot, tmp_path, OraclePolicy(robot, answer=moved.set)))
-    (result,) = results
-    found = re.fullmatch(r"the grip width changed by \+(.*) mm since the grasp: the part moved", result.outcome)
-    assert found and float(found[1]) == pytest.approx(0.7, abs=0.02)  # the width itself varies by about 0.01 mm
+    assert [result.outcome for result in results] == [
+        "the grip width changed by +0.70 mm since the grasp: the part moved"
+    ]
     assert phases_of_moves_with_a_part(tmp_path / "session.mcap") >= {"descend", "retreat"}
     assert robot.cell.truth()["part"] is None or robot.cell.truth()["part"]["phase"] != "gripped"
 
