@@ -26,6 +26,8 @@ ParamBlock<Params> ModelSpec::add_params(const char* kind, const std::string& ow
   for (std::size_t i = 0; i < Params<double>::names.size(); ++i) {
     const char* const param = Params<double>::names[i];
     const std::string name = owner + "." + param;
+    const std::string wrong = not_finite(name, numbers[i]);
+    if (!wrong.empty()) reject(wrong);
     if (!used_names_.insert(kind + (":" + name)).second) {
       reject("the name '" + owner + "' is used twice (parameter " + name + ")");
     }
@@ -98,6 +100,9 @@ int ModelSpec::add_joint(const JointDef& def) {
   if (!model_.joints.empty() && def.body < model_.joints.back().body) {
     reject(owner + ": joints must be added in the order of their bodies");
   }
+  check_finite(owner, "pos", def.pos);
+  check_finite(owner, "axis", def.axis);
+  if (!std::isfinite(def.ref)) reject(owner + ": ref must be finite");
   Joint joint;
   joint.name = def.name;
   joint.type = joint_type(owner, def.type);
@@ -179,6 +184,7 @@ int ModelSpec::add_points(const PointsDef& def) {
     reject(owner + ": a radius goes with a single point, the sphere's centre");
   }
   if (def.areas && def.areas->size() != def.points.size()) reject(owner + ": as many areas as points are needed");
+  for (std::size_t i = 0; def.areas && i < def.areas->size(); ++i) check_finite(owner, "area", (*def.areas)[i]);
   PointSet set;
   set.name = def.name;
   set.radius = def.radius;
@@ -230,6 +236,8 @@ int ModelSpec::add_pad(const PadDef& def) {
   if (axes.size() != markers || weights.size() != markers) {
     reject(owner + ": every marker needs a position, axes and a weight");
   }
+  for (const auto& position : def.positions) check_finite(owner, "position", position);
+  for (const auto& frame : axes) check_finite(owner, "axes", frame.reshaped());
   for (const int s : def.shapes) {
     if (s < 0 || s >= count(model_.shapes)) reject(owner + ": no such shape");
   }

@@ -75,12 +75,20 @@ ParamSign param_sign(std::string_view name, double value) {
 }
 
 template <class T>
+std::string not_finite(const std::string& name, T value) {
+  if (std::isnan(value)) return message(name, "be a number", value);
+  if (std::isinf(value) && !is_limit(name)) return message(name, "be finite", value);
+  return {};
+}
+
+template <class T>
 std::string wrong_parameter(const Model& model, const T* params) {
   for (std::size_t i = 0; i < model.param_signs.size(); ++i) {
     const ParamSign sign = model.param_signs[i];
-    if (std::isnan(params[i])) return message(model.param_names[i], "be a number", params[i]);
-    if (std::isinf(params[i]) && std::isfinite(model.param_defaults[i]) && !is_limit(model.param_names[i]))
-      return message(model.param_names[i], "be finite", params[i]);
+    if (!std::isfinite(params[i])) {
+      const std::string wrong = not_finite(model.param_names[i], params[i]);
+      if (!wrong.empty()) return wrong;
+    }
     if (sign == ParamSign::positive && params[i] <= T(0))
       return message(model.param_names[i], "be positive", params[i]);
     if (sign == ParamSign::not_negative && params[i] < T(0)) {
@@ -101,6 +109,8 @@ std::string wrong_parameter(const Model& model, const T* params) {
   return {};
 }
 
+template std::string not_finite<double>(const std::string&, double);
+template std::string not_finite<float>(const std::string&, float);
 template std::string wrong_parameter<double>(const Model&, const double*);
 template std::string wrong_parameter<float>(const Model&, const float*);
 

@@ -1,5 +1,6 @@
 """Wrong arguments of a simulator are refused by a UsageError of one line that names them."""
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -196,6 +197,30 @@ def test_wrong_parameter(name: str, value: float, message: str, precision: Any) 
     values = torch.tensor([float(right), value], dtype=torch_state(sim).q.dtype)
     with pytest.raises(UsageError, match=match if np.isfinite(value) else f"^{name} is not finite"):
         torch_rollout(sim, torch_state(sim), torch.zeros((2, 2, 6), dtype=values.dtype), params={name: values})
+
+
+NOT_FINITE = [
+    ("joints", {"damping": np.nan}, "parameter 'gripper_yaw.damping' must be a number, got nan"),
+    ("joints", {"stiffness": np.inf}, "parameter 'gripper_yaw.stiffness' must be finite, got inf"),
+    ("joints", {"ref": np.nan}, "joint 'gripper_yaw': ref must be finite"),
+    ("joints", {"pos": np.array([0, np.nan, 0])}, "joint 'gripper_yaw': pos has an entry that is not finite"),
+    ("joints", {"axis": np.array([np.inf, 0, 0])}, "joint 'gripper_yaw': axis has an entry that is not finite"),
+    ("actuators", {"kp": np.nan}, "parameter 'gripper_x.kp' must be a number, got nan"),
+    ("pads", {"positions": np.full((130, 3), np.nan)}, "pad 'pad': position has an entry that is not finite"),
+    ("pads", {"axes": np.full((130, 3, 3), np.inf)}, "pad 'pad': axes has an entry that is not finite"),
+    ("points", {"areas": np.full((66, 3), np.nan), "per_area": True}, "points 'pad': area has an entry that is not"),
+]
+
+
+@pytest.mark.parametrize(("kind", "values", "message"), NOT_FINITE)
+def test_a_number_of_an_element_that_is_not_finite(kind: str, values: dict[str, Any], message: str) -> None:
+    scene = load_scene("pushing", friction="viscous")
+    first, *others = getattr(scene, kind)
+    changes: dict[str, Any] = {kind: (replace(first, **values), *others)}
+    with pytest.raises(UsageError, match=re.escape(message)):
+        replace(scene, **changes).build()
+    with pytest.raises(UsageError, match=re.escape("parameter 'gravity.z' must be a number, got nan")):
+        replace(scene, gravity=np.array([0, 0, np.nan])).build()
 
 
 def test_a_pad_may_have_the_name_of_an_actuator(tmp_path: Path) -> None:
