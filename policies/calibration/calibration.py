@@ -227,9 +227,9 @@ def _pairs(fitted: tuple[Parameter, ...], result: FitResult) -> tuple[tuple[str,
 def _flow_maps(problem: Problem, after: tuple[Array, Array], rng: np.random.Generator) -> FlowMaps:
     """Recorded flow maps, and simulated ones with the scene's values and with those of `after`: a point and its poses.
 
-    With the scene's values, the poses and start heights are searched.
+    With the scene's values, the poses and start heights are searched, from one start because they explain little.
     """
-    before = find_poses(problem, problem.scene_point(), rng)
+    before = find_poses(problem, problem.scene_point(), rng, starts=1)
     recorded = problem.recorded_flow()
     return FlowMaps(
         recorded, problem.flow(*before), problem.flow(*after), problem.recordings.names, problem.errors.used

@@ -27,11 +27,11 @@ _MODEL_ERROR = 0.04  # that residuals allow for, relative to the flow maps
 
 
 def rough_problem(recordings: Recordings, *, threads: int | None = None) -> Problem:
-    """The problem of a global search, simulated with the preset `fast`.
+    """The problem of a global search, in the rough simulation of `ShearModel`.
 
-    The preset changes the flow maps by some thousandths in the median, far less than the error that is allowed for.
+    Its flow maps differ by some thousandths in the median, far less than the error that is allowed for.
     """
-    problem = Problem(recordings, threads=threads, preset="fast")
+    problem = Problem(recordings, threads=threads, rough=True)
     problem.allow_for(model_error=_MODEL_ERROR)
     return problem
 

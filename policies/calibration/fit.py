@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from gelflow.errors import SimulationError
 from gelflow.helper_process import worker_pool
@@ -157,15 +158,19 @@ def fit(
 
 def _fit_start(recordings: Recordings, seed: int, index: int, settings: FitSettings) -> StartResult | None:
     """One start; None when it cannot be simulated."""
-    rng = np.random.default_rng((seed, index))
-    problem = Problem(recordings, threads=1)
-    try:
-        point, poses = search_globally(rough_problem(recordings, threads=1), settings.members, rng)
-        point, poses = _improve(problem, point, poses, rng, settings, *_BEFORE)
-        point, poses = better_poses(problem, point, poses, rng, members=settings.nearby, count=settings.poses)
-        point, poses = _improve(problem, point, poses, rng, settings, *_AFTER)
-    except SimulationError:
-        return None
+    # With several threads in each process, the processes would wait for one another in every matrix product.
+    with threadpool_limits(1):
+        try:
+            return _searched(Problem(recordings, threads=1), np.random.default_rng((seed, index)), settings)
+        except SimulationError:
+            return None
+
+
+def _searched(problem: Problem, rng: np.random.Generator, settings: FitSettings) -> StartResult:
+    point, poses = search_globally(rough_problem(problem.recordings, threads=1), settings.members, rng)
+    point, poses = _improve(problem, point, poses, rng, settings, *_BEFORE)
+    point, poses = better_poses(problem, point, poses, rng, members=settings.nearby, count=settings.poses)
+    point, poses = _improve(problem, point, poses, rng, settings, *_AFTER)
     chi = problem.errors.chi(problem.residuals(point, poses)[0])
     return StartResult(
         point, poses, covariance(problem, point, poses, chi), _cost(problem, point, poses), chi, problem.errors.drift

@@ -12,7 +12,6 @@ from gelflow.policies.calibration.problem import Problem
 
 Array = NDArray[np.float64]
 
-_STARTS = 2  # independent searches of an insertion, until one explains the flow maps; the best one counts
 _EXPLAINED = 1.0  # root mean square of the whitened residuals up to which a search explains the flow maps
 _SPREADS = (0.3, 0.1, 0.03)  # of the ensembles after the first one
 _SIZES = (0.1, 0.05, 0.025, 0.012)  # of the local search
@@ -26,20 +25,22 @@ def find_poses(
     *,
     members: int = 64,
     count: int = 32,
+    starts: int = 2,
     threads: int | None = None,
 ) -> tuple[Array, Array]:
     """Search poses (insertions, 3) and start heights for given whitened parameters; returns the unknowns and the poses.
 
     Where an insertion cannot be simulated with these parameters, its pose is drawn from the prior. `progress` gets the
     number of finished insertions. `members` are those of the first ensemble of a search, `count` the random poses at
-    each size of the local search.
+    each size of the local search. An insertion is searched from `starts` independent starts, until one explains its
+    flow maps; the best one counts.
     """
     point, poses = np.zeros(problem.size), np.zeros((problem.insertions, 3))
     point[: len(parameters)] = parameters
     rough = rough_problem(problem.recordings, threads=threads)
     rough.allow_for(drift=problem.errors.drift)
     for i in range(problem.insertions):
-        found = _search(problem.of(i), rough.of(i), parameters, rng, members, count)
+        found = _search(problem.of(i), rough.of(i), parameters, rng, members, count, starts)
         point[len(parameters) :][problem.recordings.insertion == i] = found[0][len(parameters) :]
         poses[i] = found[1][0]
         progress(i + 1)
@@ -61,12 +62,18 @@ def better_poses(
 
 
 def _search(
-    problem: Problem, rough: Problem, parameters: Array, rng: np.random.Generator, members: int, count: int
+    problem: Problem,
+    rough: Problem,
+    parameters: Array,
+    rng: np.random.Generator,
+    members: int,
+    count: int,
+    starts: int,
 ) -> tuple[Array, Array]:
     """Unknowns and pose (1, 3) of one insertion."""
     lowest = np.inf
     best = np.concatenate([parameters, np.zeros(len(problem.recordings))]), draw_poses(problem, 0, 1, rng)
-    for _ in range(_STARTS):
+    for _ in range(starts):
         try:
             start = search_globally(rough, members, rng, parameters=parameters, spreads=_SPREADS)
         except SimulationError:

@@ -39,10 +39,10 @@ class Problem:
     no useful gradient and are searched (`gelflow.policies.calibration.poses`).
     """
 
-    def __init__(self, recordings: Recordings, *, threads: int | None = None, preset: str | None = None) -> None:
+    def __init__(self, recordings: Recordings, *, threads: int | None = None, rough: bool = False) -> None:
         if not len(recordings):
             raise UsageError("the recordings have no attempt with contact: there is nothing to fit")
-        self.readings = ReadingModel(recordings, threads=threads, preset=preset)
+        self.readings = ReadingModel(recordings, threads=threads, rough=rough)
         self.fitted = self.readings.fitted
         self._scale = self.readings.scale
         self._set_recordings(recordings)

@@ -49,6 +49,7 @@ class Scene:
     keyframe_controls: Array | None = None  # of the keyframe that gives q0, shape (nu,); None: it has none
     integrator: str = DEFAULT_INTEGRATOR  # or "bdf1"
     tolerance: float = DEFAULT_TOLERANCE  # of Newton's method, see docs/reference/physics.md
+    max_step_iterations: int = 1000  # of Newton's method, in all attempts at a step, beyond which the step fails
     precision: Precision = "double"  # default precision of a `Simulator` of this scene
     friction: str = "viscous"  # friction law of contacts and pads that set none: "viscous" or "elastic"
     gravity: Array = field(default_factory=lambda: np.array([0.0, 0.0, -9.81]))  # [m/s²], shape (3,)
@@ -145,6 +146,7 @@ class Scene:
         spec.step = self.step
         spec.integrator = self.integrator
         spec.tolerance = self.tolerance
+        spec.max_step_iterations = self.max_step_iterations
         add_bodies(spec, self.bodies, self.joints, self.limits)
         add_contacts(spec, self.shapes, self.points, self.contacts, self.pads)
         add_couplings(spec, self.tendons, self.couplings, self.loop_closures)

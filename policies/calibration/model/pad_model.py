@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
+from scipy.sparse import block_diag, csr_array, eye_array
 
 from gelflow.geometry import rotated
 from gelflow.observation import Grid, interpolation_weights, resampling_weights
@@ -34,13 +34,15 @@ class PadModel:
     def __init__(self, grids: Sequence[Grid], positions: Sequence[Array], *, printed: Grid | None = None) -> None:
         self._grids = grids
         self._pad = np.repeat(np.arange(len(grids)), [len(pad) for pad in positions])
-        self._neighbours = self._neighbours_on_grid = _nearest(positions)
-        self._to_printed: Array | None = None
-        self._to_grid: Array | None = None
+        self._exchange_on_grid = _exchange(positions)
+        # Readings without crosstalk, and their change per unit of crosstalk, as matrices.
+        self._read, self._exchange = eye_array(len(self._pad), format="csr"), self._exchange_on_grid
         if printed is not None and any(grid != printed for grid in grids):
-            self._to_printed = block_diag(*(interpolation_weights(grid, printed.positions()) for grid in grids))
-            self._to_grid = block_diag(*(resampling_weights(printed.positions(), grid) for grid in grids))
-            self._neighbours = _nearest([printed.positions()] * len(grids))
+            on_print = printed.positions()
+            to_printed = block_diag([interpolation_weights(grid, on_print) for grid in grids], format="csr")
+            to_grid = block_diag([resampling_weights(on_print, grid) for grid in grids], format="csr")
+            self._read = to_grid @ to_printed
+            self._exchange = to_grid @ _exchange([on_print] * len(grids)) @ to_printed
 
     def crosstalk_on_grid(self, crosstalk: Array) -> Array:
         """The crosstalk between markers of the policy's grid that is equivalent to `crosstalk` between printed markers.
@@ -49,22 +51,12 @@ class PadModel:
         included. Changes are medians, because neighbours are missing at the borders of the grid.
         """
         field = np.concatenate([(grid.positions() ** 2).sum(1) for grid in self._grids])[:, None]
-        on_grid = np.median(field[self._neighbours_on_grid].mean(1) - field)
+        on_grid = np.median(_product(self._exchange_on_grid, field))
         least, full = (np.median(self._mixed(field, np.asarray(c)) - field) / on_grid for c in (0.0, 1.0))
         return np.asarray(least + (full - least) * np.asarray(crosstalk))
 
-    def _on_print(self, shear: Array) -> Array:
-        return shear if self._to_printed is None else np.asarray(self._to_printed @ shear)
-
-    def _on_grid(self, vectors: Array) -> Array:
-        return vectors if self._to_grid is None else np.asarray(self._to_grid @ vectors)
-
-    def _exchange(self, printed: Array) -> Array:
-        return np.asarray(printed[..., self._neighbours, :].mean(-2) - printed)
-
     def _mixed(self, shear: Array, crosstalk: Array) -> Array:
-        printed = self._on_print(shear)
-        return self._on_grid(printed + crosstalk * self._exchange(printed))
+        return np.asarray(_product(self._read, shear) + crosstalk * _product(self._exchange, shear))
 
     def _seen(self, mixed: Array, values: Mapping[str, Array]) -> Array:
         gain, turn = (np.stack([values[f"{kind}_{side}"] for side in SIDES], -1)[..., self._pad]
@@ -84,9 +76,21 @@ class PadModel:
             own = (self._pad == k)[:, None]
             result[f"gain_{side}"] = np.where(own, reading / values[f"gain_{side}"], 0.0)
             result[f"turn_{side}"] = np.where(own, np.stack([-reading[..., 1], reading[..., 0]], -1), 0.0)
-        result["crosstalk"] = self._seen(self._on_grid(self._exchange(self._on_print(shear))), number)
+        result["crosstalk"] = self._seen(_product(self._exchange, shear), number)
         return result
 
 
-def _nearest(positions: Sequence[Array]) -> NDArray[np.int64]:
-    return nearest_markers(positions)[0][:, :_NEIGHBOURS]
+def _exchange(positions: Sequence[Array]) -> csr_array:
+    """The change of all markers per unit of crosstalk: the mean of the neighbours minus the marker, as a matrix."""
+    neighbours = nearest_markers(positions)[0][:, :_NEIGHBOURS]
+    markers, count = neighbours.shape
+    rows = np.repeat(np.arange(markers), count)
+    mean = csr_array((np.full(rows.size, 1 / count), (rows, neighbours.reshape(-1))), shape=(markers, markers))
+    return csr_array(mean - eye_array(markers))
+
+
+def _product(matrix: csr_array, vectors: Array) -> Array:
+    """The product of a matrix (markers, markers) and vectors (…, markers, k)."""
+    by_marker = np.moveaxis(vectors, -2, 0)
+    product = matrix @ by_marker.reshape(len(by_marker), -1)
+    return np.asarray(np.moveaxis(product.reshape(by_marker.shape), 0, -2))

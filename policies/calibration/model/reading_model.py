@@ -24,12 +24,12 @@ class ReadingModel:
     recordings: give task, grasp, unit, printed markers, settling time and the spread of start heights; they may have
         no attempt
     threads: of the simulator
-    preset: accuracy of the simulation; None: the scene's own settings
+    rough: see `ShearModel`
     """
 
-    def __init__(self, recordings: Recordings, *, threads: int | None = None, preset: str | None = None) -> None:
+    def __init__(self, recordings: Recordings, *, threads: int | None = None, rough: bool = False) -> None:
         self.fitted: tuple[Parameter, ...] = parameters(recordings)
-        self.forces = ShearModel(recordings.task, settle=recordings.settle, threads=threads, preset=preset)
+        self.forces = ShearModel(recordings.task, settle=recordings.settle, threads=threads, rough=rough)
         scene = self.forces.scene
         self.pads = PadModel(scene.grids, [pad.positions for pad in scene.pads], printed=recordings.printed)
         self.height_spread = recordings.height_spread

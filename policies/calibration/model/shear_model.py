@@ -6,6 +6,7 @@ forward-mode differentiation of the core (dual numbers); the grasp at rest, whic
 share, is differentiated once.
 """
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -31,6 +32,7 @@ CONTACT_QUANTITIES = ("pad_kn", "pad_mu", "pad_ks", "marker_kn", "marker_mu", "m
 QUANTITIES = (*CONTACT_QUANTITIES, "arm_stiffness", "grasp_force", "grasp_height")
 _WITHOUT_GRASP = ("hole_kn", "hole_mu")  # have no effect on the grasp at rest
 POSE = ("x", "y", "yaw", "z")  # directions of the pose of a descent, after `QUANTITIES`
+_ROUGH_ITERATIONS = 80  # of Newton's method in a step; few guesses need more, and take most of the time
 _BATCH = 64  # descents that are simulated at once
 _SIZES = 8  # numbers of descents for which a simulator is kept
 _FINGERS = (("finger_left", "pad_left"), ("finger_right", "pad_right"))
@@ -67,14 +69,16 @@ class ShearModel:
     task: task of the descents
     settle: time at the end of a descent until the reading [s]; 0 for the training environment, which reads in motion
     threads: of the simulator
-    preset: accuracy of the simulation; None: the scene's own settings
+    rough: with the preset `fast`; a descent that needs many iterations of Newton's method fails
     """
 
     def __init__(
-        self, task: InsertionTask, *, settle: float = 0.0, threads: int | None = None, preset: str | None = None
+        self, task: InsertionTask, *, settle: float = 0.0, threads: int | None = None, rough: bool = False
     ) -> None:
         self.task = task
-        self.scene = insertion_scene(task, preset=preset)
+        self.scene = insertion_scene(task, preset="fast" if rough else None)
+        if rough:
+            self.scene = dataclasses.replace(self.scene, max_step_iterations=_ROUGH_ITERATIONS)
         self._threads = threads
         step = self.scene.step
         self._settle_steps, self._hold_steps = round(SETTLE_TIME / step), round(settle / step)

@@ -46,6 +46,16 @@ def test_the_model_gives_the_forces_of_the_training_environment() -> None:
     assert np.abs(shear.reshape(2, 2, -1, 2).transpose(0, 1, 3, 2) - expected).max() < 1e-5 * np.abs(expected).max()
 
 
+def test_a_rough_descent_fails_where_a_step_needs_many_iterations(monkeypatch: pytest.MonkeyPatch) -> None:
+    values = {name: np.full(2, value) for name, value in VALUES.items()}
+    descents = Descents(np.array([[3e-3, -1e-3, 0.05], [1e-3, 4e-3, -0.1]]), np.zeros(2), np.full(2, 0.9e-3))
+    exact, _ = ShearModel(INSERTION, threads=1).shear(values, descents)
+    rough, ok = ShearModel(INSERTION, threads=1, rough=True).shear(values, descents)
+    assert ok.all() and np.abs(rough - exact).max() < 0.05 * np.abs(exact).max()
+    monkeypatch.setattr("gelflow.policies.calibration.model.shear_model._ROUGH_ITERATIONS", 1)
+    assert not ShearModel(INSERTION, threads=1, rough=True).shear(values, descents)[1].any()
+
+
 def test_derivatives_of_the_forces_agree_with_finite_differences() -> None:
     model = ShearModel(INSERTION, threads=1)
     values = {**VALUES, "grasp_height": -1e-3, "arm_stiffness": 1e4}

@@ -35,7 +35,7 @@ def test_two_updates_with_half_of_the_recordings_equal_one_with_all() -> None:
 
 
 def test_the_search_finds_unknowns_that_no_random_guess_comes_near(world: RecordedWorld) -> None:
-    problem = Problem(world.recordings.of(np.arange(2)), preset="fast")
+    problem = Problem(world.recordings.of(np.arange(2)), rough=True)
     problem.allow_for(model_error=0.04)
     point, poses = ensemble.search_globally(problem, 96, np.random.default_rng(0))
     residuals, ok = ensemble._residuals(problem, point[None], poses[None])
@@ -63,7 +63,7 @@ def test_wrong_poses_are_replaced_and_right_ones_kept(world: RecordedWorld) -> N
 
 
 def test_guesses_that_cannot_be_simulated_end_the_search(world: RecordedWorld, monkeypatch: pytest.MonkeyPatch) -> None:
-    problem = Problem(world.recordings.of(np.arange(1)), preset="fast")
+    problem = Problem(world.recordings.of(np.arange(1)), rough=True)
     predicted = problem.predicted
     monkeypatch.setattr(problem, "predicted", lambda *given: (predicted(*given)[0], np.zeros(len(given[1]), np.bool_)))
     with pytest.raises(SimulationError, match="most guesses"):

@@ -4,6 +4,7 @@ import os
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -210,10 +211,8 @@ def test_failed_environment_keeps_its_last_state_and_does_not_affect_others(
 
 
 def test_iteration_limit_gives_a_failure_status(insertion: Scene) -> None:
-    spec = insertion.model_spec()
-    spec.max_step_iterations = 1
-    sim = Simulator(_core.Model(spec))
-    sim.q[:] = start = insertion.q0
+    sim = Simulator(replace(insertion, max_step_iterations=1))
+    start = insertion.q0
     sim.step(controls(insertion)[0, :1])
     assert sim.status[0] == 1
     np.testing.assert_array_equal(sim.q[0], start)
