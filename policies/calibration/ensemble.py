@@ -29,7 +29,8 @@ _MODEL_ERROR = 0.04  # that residuals allow for, relative to the flow maps
 def rough_problem(recordings: Recordings, *, threads: int | None = None) -> Problem:
     """The problem of a global search, in the rough simulation of `ShearModel`.
 
-    Its flow maps differ by some thousandths in the median, far less than the error that is allowed for.
+    Its flow maps differ by some thousandths in the median, far less than the error that is allowed for. The few guesses
+    that need many iterations would take most of the time, so they fail, until more than half of an ensemble need them.
     """
     problem = Problem(recordings, threads=threads, rough=True)
     problem.allow_for(model_error=_MODEL_ERROR)
@@ -92,6 +93,8 @@ def _invert(
     left = 1.0  # share of the recordings that is not yet taken into account
     for _ in range(rounds):
         residuals, ok = _residuals(problem, points, poses)
+        if ok.sum() <= members // 2 and problem.readings.forces.lift_iteration_limit():
+            residuals, ok = _residuals(problem, points, poses)
         if ok.sum() <= members // 4:
             raise SimulationError("the recorded descents cannot be simulated with most guesses of the parameters")
         costs = np.where(ok, _costs(problem, residuals, points, poses), np.inf)

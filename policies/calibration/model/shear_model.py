@@ -32,7 +32,7 @@ CONTACT_QUANTITIES = ("pad_kn", "pad_mu", "pad_ks", "marker_kn", "marker_mu", "m
 QUANTITIES = (*CONTACT_QUANTITIES, "arm_stiffness", "grasp_force", "grasp_height")
 _WITHOUT_GRASP = ("hole_kn", "hole_mu")  # have no effect on the grasp at rest
 POSE = ("x", "y", "yaw", "z")  # directions of the pose of a descent, after `QUANTITIES`
-_ROUGH_ITERATIONS = 80  # of Newton's method in a step; few guesses need more, and take most of the time
+_ITERATION_LIMIT = 80  # of Newton's method in a step of a rough simulation
 _BATCH = 64  # descents that are simulated at once
 _SIZES = 8  # numbers of descents for which a simulator is kept
 _FINGERS = (("finger_left", "pad_left"), ("finger_right", "pad_right"))
@@ -69,16 +69,16 @@ class ShearModel:
     task: task of the descents
     settle: time at the end of a descent until the reading [s]; 0 for the training environment, which reads in motion
     threads: of the simulator
-    rough: with the preset `fast`; a descent that needs many iterations of Newton's method fails
+    rough: with the preset `fast`; a descent fails if a step needs many iterations, see `lift_iteration_limit`
     """
 
     def __init__(
         self, task: InsertionTask, *, settle: float = 0.0, threads: int | None = None, rough: bool = False
     ) -> None:
         self.task = task
-        self.scene = insertion_scene(task, preset="fast" if rough else None)
+        self.scene = self._without_limit = insertion_scene(task, preset="fast" if rough else None)
         if rough:
-            self.scene = dataclasses.replace(self.scene, max_step_iterations=_ROUGH_ITERATIONS)
+            self.scene = dataclasses.replace(self.scene, max_step_iterations=_ITERATION_LIMIT)
         self._threads = threads
         step = self.scene.step
         self._settle_steps, self._hold_steps = round(SETTLE_TIME / step), round(settle / step)
@@ -89,6 +89,13 @@ class ShearModel:
         self._arm_q = [self.scene.q(name).start for name in ARM_JOINTS]
         self._arm_u = [self.scene.u(name) for name in ARM_JOINTS]
         self._sims: dict[int, Simulator] = {}
+
+    def lift_iteration_limit(self) -> bool:
+        """Simulate descents from now on that need many iterations; returns whether they failed before."""
+        limited = self.scene is not self._without_limit
+        self.scene = self._without_limit
+        self._sims.clear()
+        return limited
 
     def _sim(self, count: int) -> Simulator:
         if count not in self._sims:

@@ -52,8 +52,11 @@ def test_a_rough_descent_fails_where_a_step_needs_many_iterations(monkeypatch: p
     exact, _ = ShearModel(INSERTION, threads=1).shear(values, descents)
     rough, ok = ShearModel(INSERTION, threads=1, rough=True).shear(values, descents)
     assert ok.all() and np.abs(rough - exact).max() < 0.05 * np.abs(exact).max()
-    monkeypatch.setattr("gelflow.policies.calibration.model.shear_model._ROUGH_ITERATIONS", 1)
-    assert not ShearModel(INSERTION, threads=1, rough=True).shear(values, descents)[1].any()
+    monkeypatch.setattr("gelflow.policies.calibration.model.shear_model._ITERATION_LIMIT", 1)
+    model = ShearModel(INSERTION, threads=1, rough=True)
+    assert not model.shear(values, descents)[1].any()
+    assert model.lift_iteration_limit() and not model.lift_iteration_limit()
+    np.testing.assert_array_equal(model.shear(values, descents)[0], rough)
 
 
 def test_derivatives_of_the_forces_agree_with_finite_differences() -> None:

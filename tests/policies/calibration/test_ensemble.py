@@ -68,3 +68,18 @@ def test_guesses_that_cannot_be_simulated_end_the_search(world: RecordedWorld, m
     monkeypatch.setattr(problem, "predicted", lambda *given: (predicted(*given)[0], np.zeros(len(given[1]), np.bool_)))
     with pytest.raises(SimulationError, match="most guesses"):
         ensemble.search_globally(problem, 8, np.random.default_rng(0))
+
+
+def test_an_iteration_limit_that_most_guesses_exceed_is_lifted(
+    world: RecordedWorld, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gelflow.policies.calibration.model.shear_model._ITERATION_LIMIT", 1)
+    found = []
+    for lifted in (True, False):
+        problem = Problem(world.recordings.of(np.arange(1)), threads=1, rough=True)
+        if lifted:
+            problem.readings.forces.lift_iteration_limit()
+        poses = world.misalignment[:1]
+        found.append(ensemble.search_nearby(problem, np.zeros(problem.size), poses, 0.1, 8, np.random.default_rng(0)))
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_array_equal(one, other)
