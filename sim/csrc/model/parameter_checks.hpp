@@ -14,8 +14,8 @@ enum class ParamSign : std::uint8_t { any, not_negative, positive };
 // Of the parameter `name` of an element that is no actuator; `value`: its value in the model.
 ParamSign param_sign(std::string_view name, double value);
 
-// What the value of a parameter must be where it is not finite, such as "parameter 'box.mass' must be a number, got nan";
-// else empty. Limits may be infinite.
+// The error of a parameter whose value is not finite, such as "parameter 'box.mass' must be a number, got nan"; else
+// empty. Limits may be infinite.
 template <class T>
 std::string not_finite(const std::string& name, T value);
 
