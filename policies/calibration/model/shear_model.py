@@ -92,10 +92,11 @@ class ShearModel:
 
     def lift_iteration_limit(self) -> bool:
         """Simulate descents from now on that need many iterations; returns whether they failed before."""
-        limited = self.scene is not self._without_limit
+        if self.scene is self._without_limit:
+            return False
         self.scene = self._without_limit
         self._sims.clear()
-        return limited
+        return True
 
     def _sim(self, count: int) -> Simulator:
         if count not in self._sims:
