@@ -20,6 +20,7 @@
 
 #include <array>
 #include <cmath>
+#include <utility>
 
 #include "image.hpp"
 
@@ -29,8 +30,9 @@ namespace gelflow::perception {
 typedef float FloatPack __attribute__((vector_size(32)));
 typedef std::int32_t IntPack __attribute__((vector_size(32)));
 constexpr int pack_size = 8;
-constexpr double coarse_tolerance = 0.1;  // step [px] down to which every second line suffices
-constexpr double tolerance = 0.015;       // converged: the next step would be about a tenth of this one [px]
+constexpr double coarse_tolerance = 0.1;    // step [px] down to which every second line suffices
+constexpr double contrast_tolerance = 0.1;  // step of the contrast / contrast at rest down to which a fit has converged
+constexpr double tolerance = 0.015;         // converged: the next step would be about a tenth of this one [px]
 
 struct DotProfile {
   static constexpr int steps = 256;
@@ -233,6 +235,20 @@ struct FitSettings {
   double noise;   // standard deviation of a pixel at rest / background
 };
 
+// Mean of the pixels along the border of the window that are inside the image; 0 without any.
+inline double border_mean(const Window& window, int width, int height) {
+  double sum = 0;
+  int count = 0;
+  const int size = window.size;
+  for (int i = 0; i < size; ++i)
+    for (const auto& [x, y] : {std::pair{i, 0}, {i, size - 1}, {0, i}, {size - 1, i}}) {
+      const int column = window.left + x, row = window.top + y;
+      if (column < 0 || row < 0 || column >= width || row >= height) continue;
+      sum += double(window.pixels[std::size_t(size * y + x)]), ++count;
+    }
+  return count ? sum / count : 0;
+}
+
 // Fits one dot, starting at `position`. `rest_contrast` is the contrast for which H⁻¹ was computed, `tolerated` the
 // scale of the robust weight k relative to background times contrast. Without a `mask`, the shape describes the whole
 // dot. The quality is 0 when the fit leaves the central
@@ -248,12 +264,8 @@ inline DotFit fit_dot(const Plane& plane, const FitSettings& settings, const Dot
   const Point corner = {window.left + middle, window.top + middle}, begin = position - corner;
   copy_window(plane.row(0) + std::ptrdiff_t(window.top) * plane.stride + window.left, plane.stride, size,
               window.pixels.data());
-  // The mean along the border of the window is a sufficient initial value.
-  double background = 0;
-  for (int i = 0; i < size; ++i)
-    for (int edge : {i, size * (size - 1) + i, size * i, size * i + size - 1})
-      background += window.pixels[std::size_t(edge)];
-  background = std::max(4.0, background / (4 * size));
+  // The mean along the border of the window, without pixels outside the image, is a sufficient initial value.
+  const double background = std::max(4.0, border_mean(window, plane.width, plane.height));
   FitState state{};
   state.x = float(begin.x), state.y = float(begin.y), state.a = float(rest_contrast), state.b = float(background);
   bool coarse = true;
@@ -275,7 +287,8 @@ inline DotFit fit_dot(const Plane& plane, const FitSettings& settings, const Dot
                           !(state.a * rest_contrast > 0.01 * rest_contrast * rest_contrast);
     if (diverged) return {position, 0, 0};
     const double moved = std::max(std::abs(step[0]), std::abs(step[1]));
-    if (!coarse && moved < tolerance) break;
+    const bool settled = std::abs(step[2]) < contrast_tolerance * std::abs(rest_contrast);
+    if (!coarse && moved < tolerance && settled) break;
     coarse = coarse && moved > coarse_tolerance;
   }
   const double edge = std::max(state.edge, 1e-9);

@@ -12,11 +12,14 @@ MIDDLE = (160.0, 120.0)
 
 def draw(centers: np.ndarray, radii: np.ndarray, *, bright: bool = False, seed: int = 0) -> np.ndarray:
     """An image of discs, eight times oversampled, with blur and noise."""
-    fine, shift = 8, 4
-    plane = np.full((SIZE[1] * fine, SIZE[0] * fine), 60 if bright else 150, dtype=np.uint8)
-    for center, radius in zip(((centers + 0.5) * fine * 2**shift).round().astype(int).tolist(), radii, strict=True):
+    fine, shift, margin = 8, 4, 8  # the blur mixes in what is beyond the image border
+    size = (SIZE[0] + 2 * margin, SIZE[1] + 2 * margin)
+    plane = np.full((size[1] * fine, size[0] * fine), 60 if bright else 150, dtype=np.uint8)
+    at = (centers + margin + 0.5) * fine * 2**shift
+    for center, radius in zip(at.round().astype(int).tolist(), radii, strict=True):
         cv2.circle(plane, tuple(center), round(radius * fine * 2**shift), 220 if bright else 60, -1, shift=shift)
-    small = cv2.GaussianBlur(cv2.resize(plane, SIZE, interpolation=cv2.INTER_AREA).astype(float), (0, 0), 0.8)
+    small = cv2.GaussianBlur(cv2.resize(plane, size, interpolation=cv2.INTER_AREA).astype(float), (0, 0), 0.8)
+    small = small[margin:-margin, margin:-margin]
     noise = np.random.default_rng(seed).normal(0, 1.0, (*small.shape, 3))
     return (small[..., None] + noise).clip(0, 255).round().astype(np.uint8)
 
