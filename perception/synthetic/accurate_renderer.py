@@ -149,7 +149,7 @@ class AccurateGelRenderer:
         warp = appearance.warp
         lens = np.stack([warp(undistorted + step) - warp(undistorted - step) for step in 0.5 * np.eye(2)], axis=-1)
         oval = np.diag([np.sqrt(appearance.oval), 1 / np.sqrt(appearance.oval)])
-        return warp(undistorted), lens @ gel @ oval
+        return warp(undistorted + self._print.offset), lens @ gel @ oval
 
 
 def _encode_jpeg(image: Image, quality: int) -> bytes:

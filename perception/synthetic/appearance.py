@@ -47,6 +47,7 @@ _DEGRADATION_LIMITS: dict[str, tuple[float, float]] = {
     "oval": (1.0, 3.0),
     "radius_spread": (0.0, 0.2),
     "ragged": (0.0, 0.2),
+    "print_offset": (0.0, 0.1),
     "blur": (0.5, 20.0),  # an edge sharper than a pixel has no exact centre
 }
 
@@ -104,9 +105,9 @@ class GelAppearance:
 class DegradedGelAppearance(GelAppearance):
     """Parameters of a gel with imperfect print, illumination, lens and contact; the defaults add no imperfection.
 
-    `missing`, `damaged`, `bridges`, `radius_spread` and `ragged` belong to the print and move with the gel;
-    illumination, `dust` and `occluders` are fixed to the camera; `shading`, `ridges` and `highlights` move with the
-    contact. `noise` is the noise of the grey image.
+    `missing`, `damaged`, `bridges`, `radius_spread`, `ragged` and `print_offset` belong to the print and move with the
+    gel; illumination, `dust` and `occluders` are fixed to the camera; `shading`, `ridges` and `highlights` move with
+    the contact. `noise` is the noise of the grey image.
     """
 
     gradient: float = 0.0  # relative brightness difference from the mean at opposite borders, 0 to 0.9
@@ -124,6 +125,7 @@ class DegradedGelAppearance(GelAppearance):
     oval: float = 1.0  # width / height of a dot, 1 to 3
     radius_spread: float = 0.0  # standard deviation of the dots' radii / `radius`, 0 to 0.2
     ragged: float = 0.0  # standard deviation of a dot's outline from its ellipse / radius, 0 to 0.2
+    print_offset: float = 0.0  # standard deviation of a dot from the grid along each axis / marker spacing, 0 to 0.1
     cut_row: bool = False  # adds a row of dots above the first, cut by the image border; its dots are no markers
 
     def __post_init__(self) -> None:
@@ -156,17 +158,19 @@ PRESETS: dict[str, dict[str, Any]] = {
     "typical": {
         **{"blur": 1.0, "noise": 1.5, "shot": 0.02, "quality": 90, "gradient": 0.3, "colour": 0.55},
         **{"shading": 0.35, "barrel": 0.02, "dust": 2, "radius_spread": 0.03, "ragged": 0.03},
+        "print_offset": 0.005,
     },
     "hard": {
         **{"blur": 1.4, "noise": 2.5, "shot": 0.02, "quality": 75, "gradient": 0.45, "colour": 0.8},
         **{"shading": 0.7, "ridges": 0.5, "barrel": 0.02, "dust": 2, "contrast": 0.6, "missing": 0.03},
         **{"damaged": 0.06, "bridges": 2, "occluders": 1, "motion_blur": 0.5},
-        **{"radius_spread": 0.05, "ragged": 0.04},
+        **{"radius_spread": 0.05, "ragged": 0.04, "print_offset": 0.005},
     },
     # The most uneven of ten published prints: a hand-made one.
     "print": {
         **{"blur": 1.0, "noise": 1.5, "shot": 0.02, "quality": 90, "gradient": 0.3, "colour": 0.55},
         **{"shading": 0.35, "barrel": 0.02, "dust": 2, "radius_spread": 0.095, "ragged": 0.06},
+        "print_offset": 0.01,
     },
 }
 

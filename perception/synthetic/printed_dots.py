@@ -191,6 +191,9 @@ class DotPrint:
         radii = 1 + appearance.radius_spread * rng.normal(size=markers).clip(-_LARGEST, _LARGEST)
         self._radii = radii[:, None, None]  # relative to `appearance.radius`
         self._outlines = Outlines(appearance.ragged, markers, rng) if appearance.ragged else None
+        offset = rng.normal(size=(markers, 2)).clip(-_LARGEST, _LARGEST)
+        # Of the dots from the grid, in the undistorted image (right, down) [px], shape (markers, 2).
+        self.offset = appearance.print_offset * appearance.spacing * offset
 
     def draw(self, centers: Array, shapes: Array, motion_blur: Array) -> tuple[Layer, DotPatches]:
         """Transmission (0 to 1) of the print, shape (height, width), and the patches of the markers."""

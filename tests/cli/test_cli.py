@@ -100,9 +100,8 @@ def printed_json(capsys: pytest.CaptureFixture[str], *arguments: str, status: in
 
 def test_json_of_the_perception_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     images, table, fit = tmp_path / "images", tmp_path / "table.csv", tmp_path / "gel.json"
-    rendered = printed_json(
-        capsys, "render", "--out", str(images), "--frames", "3", "--markers", "63", "--motion", "rest"
-    )
+    regular = ("--markers", "63", "--set", "print_offset=0")
+    rendered = printed_json(capsys, "render", "--out", str(images), "--frames", "3", *regular, "--motion", "rest")
     assert rendered == {"images": 3, "out": str(images), "truth": str(images / "truth.npz")}
     tracked = printed_json(capsys, "track", str(images), "--out", str(table))
     assert tracked["images"] == 3 and tracked["rows"] * tracked["cols"] == 63 and tracked["files"] == [str(table)]
