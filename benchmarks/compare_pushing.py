@@ -22,7 +22,7 @@ def main() -> int:
     args = parser.parse_args()
     reference = load(args.file)
     result = compare(reference)
-    console = Console()
+    console = Console(markup=False)
     console.print(table(reference, result))
     largest = float(np.abs(result.difference).max())
     console.print(f"Largest velocity term, tangential part of kₜ ω × (d n): {result.largest_term:.1e} N.")

@@ -34,7 +34,7 @@ def main() -> int:
     args = parser.parse_args()
     gel = ElasticGel(args.youngs_modulus, args.poisson_ratio, args.thickness)
     table = _slip(gel, args) if args.quantity == "slip" else _forces(gel, args)
-    Console(width=140 if args.quantity == "slip" else None).print(table)
+    Console(width=140 if args.quantity == "slip" else None, markup=False).print(table)
     return 0
 
 

@@ -108,10 +108,10 @@ def write(file: Path, record: dict[str, Any], as_json: bool, *tables: Renderable
     if as_json:
         print(text, end="")
         return
-    console = Console(width=WIDTH, highlight=False)
+    console = Console(width=WIDTH, highlight=False, markup=False)
     for table in tables:
         console.print(table)
-    console.print(str(file), soft_wrap=True, markup=False)
+    console.print(str(file), soft_wrap=True)
 
 
 def save(file: Path, record: dict[str, Any]) -> str:

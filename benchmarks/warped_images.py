@@ -33,7 +33,7 @@ def main() -> int:
             raise UsageError(f"{path}: {error}") from None
         values = (errors.gelflow, errors.lucas_kanade, errors.gelflow_shaded, errors.lucas_kanade_shaded)
         table.add_row(errors.image, str(errors.markers), *(f"{value:.3f}" for value in values))
-    Console().print(table)
+    Console(markup=False).print(table)
     return 0
 
 

@@ -110,7 +110,7 @@ def main() -> None:
     table = Table("trained", *columns, title="inserted [%]")
     for trained_name, values in cells.items():
         table.add_row(trained_name, *(f"{100 * values[column]['success']:.1f}" for column in columns))
-    Console(width=120).print(table)
+    Console(width=120, markup=False).print(table)
 
 
 def train_and_evaluate(row: Row, columns: list[Row], folder: Path, args: argparse.Namespace) -> dict[str, Any]:

@@ -49,7 +49,7 @@ def main() -> None:
             for name, page in (("no", None), ("no, again", None), ("open", window)):
                 run = first if name == "no" else demo(args, seed, page)
                 table.add_row(name, *row(run, first), end_section=page is not None)
-    Console(width=100).print(table)
+    Console(width=100, markup=False).print(table)
 
 
 def row(run: Run, first: Run) -> list[str]:

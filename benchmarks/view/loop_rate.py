@@ -35,7 +35,7 @@ def main() -> None:
                     stack.enter_context(browser()).open(viewer.url)
                 rates.append(rate(sim, viewer.update, args.seconds))
         table.add_row(scene, *(f"{steps:.0f}" for steps in rates))
-    Console(width=80).print(table)
+    Console(width=80, markup=False).print(table)
 
 
 def rate(sim: gs.Simulator, update: Callable[[], None], seconds: float) -> float:

@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING, Any
 
 from rich.table import Table
 
+from gelflow.cli.output import yes_or_no
+
 if TYPE_CHECKING:
     from gelflow.real.runner.insertion.attempt import Attempt, Insertion
     from gelflow.real.runner.preflight import PreflightItem
@@ -33,7 +35,7 @@ def preflight_table(items: "list[PreflightItem]") -> Table:
     """Table of the checks before the first motion."""
     table = Table(title="Preflight", show_header=False, box=None)
     for item in items:
-        table.add_row("[green]ok[/]" if item.good else "[red]no[/]", item.name, item.text)
+        table.add_row(yes_or_no(item.good), item.name, item.text)
     return table
 
 

@@ -7,6 +7,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
+from rich.text import Text
 
 from gelflow.session.records import to_plain
 
@@ -19,11 +20,12 @@ class Output:
 
     def __init__(self, as_json: bool = False, *, width: int | None = None) -> None:
         self.json = as_json
-        self.console = Console(highlight=False, stderr=self.json, width=width)
+        # Without markup: square brackets are part of units and file names.
+        self.console = Console(highlight=False, markup=False, stderr=self.json, width=width)
 
     def text(self, line: str) -> None:
-        """Print one line without markup or line breaks."""
-        self.console.print(line, markup=False, soft_wrap=True)
+        """Print one line without line breaks."""
+        self.console.print(line, soft_wrap=True)
 
     def wide_table(self, table: Table) -> None:
         """Print a table of numbers; a narrower terminal breaks its lines, and no number is shortened."""
@@ -38,13 +40,19 @@ class Output:
             print(json.dumps(to_plain(values), indent=2, allow_nan=False))
 
 
+def yes_or_no(good: bool) -> Text:
+    """A cell of a table of checks: a green "ok" or a red "no"."""
+    return Text("ok", style="green") if good else Text("no", style="red")
+
+
 def progress_bar(*columns: ProgressColumn, count: bool = False, auto_refresh: bool = True) -> Progress:
     """A progress bar on standard error that disappears at the end; invisible unless standard error is a terminal.
 
     `count` shows the number of finished items; `columns` are added before the remaining time.
     """
-    errors = Console(stderr=True)
-    shown = [TextColumn("{task.description}"), BarColumn(), *([MofNCompleteColumn()] if count else []), *columns]
+    errors = Console(stderr=True, markup=False)
+    counter = [MofNCompleteColumn()] if count else []
+    shown = [TextColumn("{task.description}", markup=False), BarColumn(), *counter, *columns]
     return Progress(
         *shown,
         TimeRemainingColumn(),

@@ -19,7 +19,7 @@ def read_line(console: Console, text: str, *, check: Callable[[], object] = lamb
     Keys that were typed at a terminal before the question are discarded. Raises UsageError when standard input is
     closed.
     """
-    console.print(f"[bold]{text}[/] ", end="")
+    console.print(f"{text} ", style="bold", end="")
     console.file.flush()
     descriptor = _standard_input()
     if os.isatty(descriptor):
@@ -39,7 +39,7 @@ def read_line(console: Console, text: str, *, check: Callable[[], object] = lamb
 
 def confirmed(console: Console, text: str, *, check: Callable[[], object] = lambda: None) -> bool:
     """Ask a question; True for the answer "y" or "yes"."""
-    return read_line(console, f"{text} \\[y/N]", check=check).lower() in ("y", "yes")
+    return read_line(console, f"{text} [y/N]", check=check).lower() in ("y", "yes")
 
 
 def _standard_input() -> int:

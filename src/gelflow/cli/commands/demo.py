@@ -182,7 +182,7 @@ def _run_series(output: Output, series: _Series) -> _SeriesResult:
     robot = mock_robot(factor=series.factor, seed=series.seed, preset=series.preset, part=series.part)
     with robot as (lab_path, truth_url):
         lab = load_lab(lab_path)
-        output.console.print(f"[bold]{series.title}[/]")
+        output.console.print(series.title, style="bold")
         output.text(f"{lab.gripper.address}, UDP {lab.arm.egm_port}, two MJPEG cameras")
         output.text(ATTEMPT_HEADER)
         observer = _Observer(output, truth_url)

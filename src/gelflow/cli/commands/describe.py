@@ -52,9 +52,10 @@ def run(args: argparse.Namespace) -> int:
         times = None if args.no_timing else dataclasses.asdict(_measured(scene, args.repeats))
         output.result(dataclasses.asdict(description) | {"times": times})
         return SUCCESS
-    output.console.print(tree(description), *_hints(description), _not_modelled(description), _size(description.size))
+    parts = (tree(description), *_hints(description), _not_modelled(description), _size(description.size))
+    output.console.print(*parts, markup=True)
     if not args.no_timing:
-        output.console.print(_times(_measured(scene, args.repeats)))
+        output.console.print(_times(_measured(scene, args.repeats)), markup=True)
     return SUCCESS
 
 

@@ -69,7 +69,7 @@ def show(measured: "Tradeoff", title: str, output: Output) -> None:
     console.print()
     console.print(dominated(measured))
     for name, reason in measured.failed.items():
-        console.print(f"failed: {name}: {reason}", markup=False)
+        console.print(f"failed: {name}: {reason}")
     console.print(_reference(measured))
 
 

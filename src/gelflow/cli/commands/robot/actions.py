@@ -12,7 +12,7 @@ from rich.table import Table
 
 from gelflow.cli.exit_codes import NEGATIVE_RESULT, SUCCESS
 from gelflow.cli.options import add_json, add_out
-from gelflow.cli.output import Output
+from gelflow.cli.output import Output, yes_or_no
 from gelflow.cli.prompt import confirmed
 from gelflow.errors import UsageError
 from gelflow.interrupts import interruptible
@@ -69,7 +69,7 @@ def _status(args: argparse.Namespace, output: Output) -> int:
     devices = read_status(load_lab(args.lab))
     table = Table(title="State of the robot", show_header=False, box=None)
     for name, values in devices.items():
-        table.add_row("[green]ok[/]" if values["ready"] else "[red]no[/]", name, values["text"])
+        table.add_row(yes_or_no(values["ready"]), name, values["text"])
     output.console.print(table)
     ready = all(values["ready"] for values in devices.values())
     output.result({"action": "status", "ready": ready, **devices})

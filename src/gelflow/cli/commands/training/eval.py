@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.box import SIMPLE_HEAD
-from rich.markup import escape
 from rich.table import Table
 
 from gelflow.cli.commands.training.task_training import TASKS, refuse, task_options
@@ -118,7 +117,7 @@ def result_table(results: "list[EvaluationResult]", task: str, path: Path, episo
     rows = [_cells(result) for result in results]
     for column, heading in enumerate(headings):
         word = max(len(text) for row in rows for text in row[column].split())  # numbers are never cut off
-        table.add_column(escape(heading), justify="left" if column == 0 else "right", min_width=word)
+        table.add_column(heading, justify="left" if column == 0 else "right", min_width=word)
     for row in rows:
         table.add_row(*row)
     return table

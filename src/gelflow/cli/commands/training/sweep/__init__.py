@@ -130,7 +130,7 @@ class _SweepProgress:
             text = f"complete in {record.seconds / 60:.1f} min"
         else:
             text = f"{record.error}{'; it is started again' if again else ''}"
-        self._progress.console.print(f"{run.name}: {text}", markup=False, highlight=False, soft_wrap=True)
+        self._progress.console.print(f"{run.name}: {text}", highlight=False, soft_wrap=True)
         if not again:
             self._progress.advance(self._task)
 
