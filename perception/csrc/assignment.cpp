@@ -6,13 +6,14 @@ namespace gelflow::perception {
 
 namespace {
 // Distances are fractions of the spacing.
-constexpr double seed_radius = 0.28;     // of a dot around a predicted position that starts a hypothesis
-constexpr double match_radius = 0.3;     // of a dot around the position predicted by the neighbours
-constexpr double max_difference = 0.45;  // of the displacements of neighbours
-constexpr double extrapolation = 0.7;    // damping of the linear extrapolation
-constexpr double search_radius = 1.15;   // of the markers around a dot that the placement search tries
-constexpr double motion_weight = 0.1;    // cost of moving by one spacing; an unassigned marker or dot costs 1
-constexpr int search_interval = 10;      // images between placement searches while a failure persists
+constexpr double seed_radius = 0.28;         // of a dot around a predicted position that starts a hypothesis
+constexpr double match_radius = 0.3;         // of a dot around the position predicted by the neighbours
+constexpr double max_difference = 0.45;      // of the displacements of neighbours
+constexpr double inconsistency_cost = 0.75;  // of neighbours with a larger difference; 0.5 at this difference
+constexpr double extrapolation = 0.7;        // damping of the linear extrapolation
+constexpr double search_radius = 1.15;       // of the markers around a dot that the placement search tries
+constexpr double motion_weight = 0.1;        // cost of moving by one spacing; an unassigned marker or dot costs 1
+constexpr int search_interval = 10;          // images between placement searches while a failure persists
 }  // namespace
 
 DotAssignment::DotAssignment(Grid grid, double spacing) : grid_(grid), spacing_(spacing) {
@@ -176,8 +177,9 @@ DotAssignment::Score DotAssignment::evaluate(const std::vector<char>& expected) 
       const int other = grid_.neighbour(m, direction);
       if (!is_assigned(other)) continue;
       const double apart = squared(displacement_of(other) - displacement) * unit;
-      score.cost += 0.5 * std::min(apart / (max_difference * max_difference), 1.0);
-      score.inconsistent += apart > max_difference * max_difference;
+      const double strain = apart / (max_difference * max_difference);
+      score.cost += strain > 1 ? inconsistency_cost : 0.5 * strain;
+      score.inconsistent += strain > 1;
     }
   }
   for (char taken : is_taken_) score.dots += !taken;

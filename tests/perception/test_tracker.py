@@ -237,6 +237,17 @@ def test_a_jump_by_most_of_a_spacing_causes_no_identity_switch(field: Field, cha
         assert (off[tracked.valid] < 0.1 * appearance.spacing).all()
 
 
+def test_markers_beside_an_occluder_are_not_exchanged() -> None:
+    appearance = make_appearance("hard", markers=63, width=640, height=480, seed=200)
+    sequence = GelSequence(appearance, "press", frames=34)
+    renderer, tracker = AccurateGelRenderer(appearance), MarkerTracker()
+    for number in (0, 1, 2, *range(6, 14)):
+        frame = renderer.render(sequence.displacement(number), number=number, **sequence.render_arguments(number))
+        tracked = tracker.track(frame.image)
+        off = np.linalg.norm(tracked.position - frame.position, axis=1)
+        assert (off[tracked.valid] < 0.3 * appearance.spacing).all()
+
+
 def test_a_jump_of_the_whole_grid_is_not_confused_with_its_neighbouring_row() -> None:
     appearance = make_appearance("typical", cut_row=True)
     renderer, tracker, still = AccurateGelRenderer(appearance), MarkerTracker(), np.zeros((130, 2))

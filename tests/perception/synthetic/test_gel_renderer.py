@@ -49,6 +49,15 @@ def test_the_ground_truth_is_the_centroid_of_the_ink(changed: dict[str, Any]) ->
     assert np.abs(off).max() < 0.003
 
 
+def test_printed_dots_are_off_the_grid() -> None:
+    regular, printed = (
+        AccurateGelRenderer(make_appearance("clean", markers=252, print_offset=offset)) for offset in (0.0, 0.02)
+    )
+    still = np.zeros((252, 2))
+    off = printed.render_noiseless(still).position - regular.render_noiseless(still).position
+    assert off.std() == pytest.approx(0.02 * printed.appearance.spacing, rel=0.1)
+
+
 def test_motion_blur_lengthens_a_dot_and_keeps_its_centre() -> None:
     appearance = make_appearance("typical", markers=63, **EVEN)
     renderer, still = AccurateGelRenderer(appearance), np.zeros((63, 2))
