@@ -18,6 +18,7 @@ constexpr double max_velocity = 0.25;       // in spacings per image; larger ste
 constexpr double trusted_quality = 0.8;     // from this quality on, a fit is not compared with the neighbours
 constexpr double outlier_distance = 0.4;    // in spacings: limit for a fit of quality 1
 constexpr float frame_change = 0.05f;       // relative change of a frame that detected dots resolve
+constexpr float refit_change = 0.01f;       // relative change of a frame that a dot is fitted again for
 constexpr int relaxation_steps = 8;
 constexpr int max_rest_images = 8;      // images averaged in the rest positions
 constexpr double rest_coherence = 0.3;  // largest ratio of coherent to independent squared displacement at rest
@@ -57,7 +58,7 @@ Tracker::Tracker(TrackerSetup setup)
     half_size_.push_back({0.9 * std::hypot(f.xy, f.yy) / area, 0.9 * std::hypot(f.xx, f.yx) / area});
   }
   positions_ = previous_ = setup_.rest;
-  shape_ = setup_.shape;
+  shape_ = next_shape_ = setup_.shape;
   velocity_.resize(n), displacement_.resize(n), relaxed_.resize(n), detection_offset_.resize(n);
   quality_.resize(n), contrasts_.resize(n);
   measured_.resize(n), filled_.resize(n), expected_.resize(n);
@@ -145,7 +146,7 @@ void Tracker::measure(const std::vector<int>& dot_of) {
   }
   for (std::size_t m = 0; m < n; ++m) {
     const DotShape now = deformed_shape(m);
-    if (differ(now, shape_[m])) shape_[m] = now;
+    if (differ(now, shape_[m], frame_change)) shape_[m] = now;
   }
   for (std::size_t m = 0; m < n; ++m) {
     quality_[m] = 0;
@@ -158,6 +159,7 @@ void Tracker::measure(const std::vector<int>& dot_of) {
     positions_ = previous_;
     return;
   }
+  refit_deformed();
   fill_missing();
   for (std::size_t m = 0; m < n; ++m) {
     if (measured_[m] || !setup_.visible[m]) continue;
@@ -167,6 +169,17 @@ void Tracker::measure(const std::vector<int>& dot_of) {
   reject_outliers();
   fill_missing();
   for (std::size_t m = 0; m < n; ++m) shape_[m] = deformed_shape(m);
+}
+
+// Fits those dots again whose shape follows from the fitted positions more exactly than from the detected dots or the
+// last image.
+void Tracker::refit_deformed() {
+  for (std::size_t m = 0; m < positions_.size(); ++m) next_shape_[m] = deformed_shape(m);
+  for (std::size_t m = 0; m < positions_.size(); ++m) {
+    if (!measured_[m] || !differ(next_shape_[m], shape_[m], refit_change)) continue;
+    shape_[m] = next_shape_[m];
+    accept(m, fit(m, positions_[m], 8), min_quality);
+  }
 }
 
 // Accepts a fit as the position of a marker if its quality reaches `threshold`.
@@ -201,10 +214,9 @@ DotShape Tracker::deformed_shape(std::size_t marker) const {
           float(f.yx * xy + f.yy * yy), f.waves};
 }
 
-// Whether two frames differ by more than the uncertainty of detected dots. Otherwise the frame of the last image, from
-// fitted positions, is more accurate.
-bool Tracker::differ(const DotShape& one, const DotShape& two) {
-  const float limit = frame_change * std::sqrt(two.xx * two.xx + two.xy * two.xy + two.yx * two.yx + two.yy * two.yy);
+// Whether two frames differ by more than `change`, relative to the second.
+bool Tracker::differ(const DotShape& one, const DotShape& two, float change) {
+  const float limit = change * std::sqrt(two.xx * two.xx + two.xy * two.xy + two.yx * two.yx + two.yy * two.yy);
   return std::abs(one.xx - two.xx) > limit || std::abs(one.xy - two.xy) > limit || std::abs(one.yx - two.yx) > limit ||
          std::abs(one.yy - two.yy) > limit;
 }

@@ -45,9 +45,10 @@ class Tracker {
 
  private:
   void measure(const std::vector<int>& dot_of);
+  void refit_deformed();
   void accept(std::size_t marker, const DotFit& found, double threshold);
   DotShape deformed_shape(std::size_t marker) const;
-  static bool differ(const DotShape& one, const DotShape& two);
+  static bool differ(const DotShape& one, const DotShape& two, float change);
   const DotMask* mask(std::size_t marker) const;
   DotFit fit(std::size_t marker, Point position, int iterations) const;
   double accepted_quality(std::size_t marker, const DotFit& fit) const;
@@ -65,6 +66,7 @@ class Tracker {
   EdgeFit edge_fit_;
   std::vector<double> rest_quality_;  // of the fits at rest
   std::vector<DotShape> shape_;       // of the dots on the deformed gel
+  std::vector<DotShape> next_shape_;  // from the fitted positions
   Plane plane_;
   DotDetector detector_;
   DotAssignment assignment_;

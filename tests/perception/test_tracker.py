@@ -228,6 +228,14 @@ def test_dots_of_different_sizes_and_ragged_outlines_are_tracked_as_exactly(
     assert np.mean([tracked.valid[frame.visible].mean() for frame, tracked, _ in results]) > 0.998
 
 
+@pytest.mark.parametrize("seed", [2000, 2001])
+def test_uneven_dots_in_a_fast_press_are_tracked_as_exactly(seed: int) -> None:
+    appearance = make_appearance("clean", seed=seed, radius_spread=0.06, ragged=0.04, markers=63, width=640, height=480)
+    results = track_sequence(GelSequence(appearance, "press", frames=8, period=10))
+    for _, tracked, off in results:
+        assert tracked.valid.all() and np.quantile(off, 0.95) < 0.04
+
+
 @pytest.mark.parametrize("field", FIELDS)
 @pytest.mark.parametrize("changed", [{}, {"missing": 0.05, "bridges": 2}, {"cut_row": True, "markers": 63}])
 def test_a_jump_by_most_of_a_spacing_causes_no_identity_switch(field: Field, changed: dict[str, float]) -> None:
