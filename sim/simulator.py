@@ -46,7 +46,8 @@ class Simulator(StateArrays):
     q, v: positions (N, nq), at first the scene's `q0`, and velocities (N, nv); like all state arrays writable views,
         whose elements are set (`sim.q[:] = …`). Then call `clear_history`, or anchors and history are those before
     params: physical parameters (N, parameters), writable; see `param`
-    anchors, anchored: state of the elastic friction law with na anchors, (N, na, 3) [m] and (N, na)
+    anchors, anchored: state of the elastic friction law with na anchors, (N, na, 3) [m], and which of them are set,
+        (N, na); an anchor that is not set has no meaning
     history: state of BDF2 with nh values, (N, nh): displacement of the previous step (nv), velocity before it (nv), and
         1 if a previous step exists; nh = 0 for BDF1
     status: (N), 0 or the reason of failure, see `STATUS_MESSAGES`
