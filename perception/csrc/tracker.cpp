@@ -171,8 +171,8 @@ void Tracker::measure(const std::vector<int>& dot_of) {
   for (std::size_t m = 0; m < n; ++m) shape_[m] = deformed_shape(m);
 }
 
-// Fits those dots again whose shape follows from the fitted positions more exactly than from the detected dots or the
-// last image.
+// Fits those dots again whose shape by the fitted positions differs from that of their fit, which is the last image's
+// where detected dots do not resolve the change.
 void Tracker::refit_deformed() {
   for (std::size_t m = 0; m < positions_.size(); ++m) next_shape_[m] = deformed_shape(m);
   for (std::size_t m = 0; m < positions_.size(); ++m) {
