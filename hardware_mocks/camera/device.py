@@ -174,6 +174,7 @@ class MockMjpegCamera:
                 self._changed.wait_for(lambda: self._closing or (self._watchers > 0 and not self._silent))
                 if self._closing:
                     return
+            exposed = self._clock.now()  # cameras stamp the exposure, not the end of the compression
             try:
                 image = self._source()
             except Exception as error:  # noqa: BLE001 - `close` raises it; the streams end
@@ -184,7 +185,7 @@ class MockMjpegCamera:
                 return
             with self._changed:
                 image = self._faults.image(image)
-                self._image, self._stamp = image, self._clock.now() + CLOCK_OFFSET
+                self._image, self._stamp = image, exposed + CLOCK_OFFSET
                 self._number += 1
                 self._changed.notify_all()
             due = max(due + self._period, self._clock.now() - self._period)

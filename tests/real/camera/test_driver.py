@@ -326,3 +326,23 @@ def test_mock_camera_stamps_each_image_with_its_own_clock() -> None:
     assert all(head.startswith(b"Content-Type: image/jpeg\r\nContent-Length: ") for head in heads)
     assert all(b - a > 0.01 for a, b in pairwise(stamps))
     assert stamps[-1] - stamps[0] < 1.0 and stamps[0] > CLOCK_OFFSET
+
+
+def test_mock_camera_stamps_the_exposure_of_an_image_and_not_its_end() -> None:
+    exposed: list[float] = []
+
+    def slow() -> bytes:
+        exposed.append(CLOCK.now())
+        time.sleep(0.01)
+        return b"%d" % len(exposed)
+
+    server = MockMjpegCamera(slow, CLOCK, rate=50.0)
+    with server, socket.create_connection(("127.0.0.1", server.port), 5.0) as link:
+        link.sendall(b"GET /?action=stream HTTP/1.0\r\n\r\n")
+        data = b""
+        while data.count(b"X-Timestamp: ") < 6:
+            data += link.recv(65536)
+    for part in data.split(b"--boundarydonotcross\r\n")[1:6]:
+        head, image = part.split(b"\r\n\r\n", 1)
+        stamp = float(head.split(b"X-Timestamp: ")[1]) - CLOCK_OFFSET
+        assert stamp <= exposed[int(image) - 1] + 1e-5
