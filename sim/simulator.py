@@ -342,6 +342,8 @@ class Simulator(StateArrays):
             array: NDArray[Any] = np.zeros((steps + 1, *present.shape), present.dtype)
         else:
             array = getattr(out, name)
+            if name == "anchors":
+                array[1:] = 0
         fill(name, array[0], present if start is None else start)
         return array
 
