@@ -48,6 +48,21 @@ def test_the_summary_fits_a_terminal(
     assert max(map(len, printed.splitlines())) <= 80
 
 
+def test_contacts_that_disagree_are_reported(tables: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    table = tables / "scale.csv"
+    lines = [line.split(",") for line in table.read_text().splitlines()[1:]]
+    factors = (1.0, 1.3)  # of every second contact
+    rows = [f"{stamp},{float(force) * factors[number // 5 % 2]}" for number, (stamp, force) in enumerate(lines)]
+    table.write_text("\n".join(["stamp,normal_n", *rows]))
+    command = ["calibrate-gel", "a.forces.csv", "--measured", "scale.csv", "--gel", "guess.toml"]
+    assert main(command) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "contacts differ by 14 %" in printed and "doubtful" in printed
+    assert main([*command, "--json", "--out", "again.toml"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["thickness_doubtful"] and result["gel"]["youngs_modulus_deviation"] > 0.2
+
+
 @pytest.mark.parametrize(
     ("changed", "named"),
     [

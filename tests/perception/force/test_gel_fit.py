@@ -52,7 +52,7 @@ def record(
 @pytest.mark.parametrize("seed", range(3))
 def test_modulus_from_a_scale(layer: PressedLayer, tmp_path: Path, seed: int) -> None:
     fit = fit_gel(read_samples(*record(layer, tmp_path, seed=seed)), GUESS)
-    assert fit.contacts == 5 and fit.thickness is None and fit.creep_deviation is None
+    assert fit.contacts == 5 and fit.thickness is None and fit.creep_deviation is None and not fit.doubtful
     error = abs(fit.gel.youngs_modulus / TRUE.youngs_modulus - 1)
     assert error < 0.04
     assert error < 2.5 * fit.gel.youngs_modulus_deviation < 0.1
@@ -88,6 +88,19 @@ def test_a_wrong_thickness_shows(layer: PressedLayer, tmp_path: Path) -> None:
     assert fit.gel.youngs_modulus_deviation > 0.1
     assert fit.creep_deviation is None  # the gel has none: a lag that is longer than the contacts is not measured
     assert abs(fit.gel.youngs_modulus / TRUE.youngs_modulus - 1) < 2 * fit.gel.youngs_modulus_deviation
+
+
+@pytest.mark.parametrize("thickness", [2e-3, 3.6e-3, 4.5e-3])
+def test_contacts_that_disagree_make_the_thickness_doubtful(
+    layer: PressedLayer, tmp_path: Path, thickness: float
+) -> None:
+    """Where both factors agree by chance, the scatter of the contacts shows the wrong thickness."""
+    wrong = replace(GUESS, thickness=thickness)
+    for seed in range(4):
+        (folder := tmp_path / str(seed)).mkdir()
+        fit = fit_gel(read_samples(*record(layer, folder, gel=wrong, seed=seed)), wrong)
+        assert fit.doubtful or fit.thickness is not None
+        assert abs(fit.gel.youngs_modulus / TRUE.youngs_modulus - 1) < 3 * fit.gel.youngs_modulus_deviation
 
 
 @pytest.mark.parametrize(

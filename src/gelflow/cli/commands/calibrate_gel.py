@@ -46,6 +46,7 @@ def run(args: argparse.Namespace) -> int:
                 "shear_factor": None if fit.shear is None else asdict(fit.shear),
                 "largest_shear_ratio": fit.largest_ratio,
                 "thickness_that_agrees": fit.thickness,
+                "thickness_doubtful": fit.doubtful,
                 "creep_deviation": fit.creep_deviation,
                 "files": [args.out, picture],
             }
@@ -68,6 +69,12 @@ def _table(fit: GelFit, images: int, files: list[Path]) -> Table:
             f"normal and shear forces disagree: try {1e3 * fit.thickness:.2f} mm instead of "
             f"{1e3 * gel.thickness:.2f} mm, track and fit again",
         )
+    elif fit.doubtful:
+        table.add_row(
+            "thickness",
+            f"doubtful: the normal forces of the contacts disagree. Measure it ({1e3 * gel.thickness:.2f} mm is stated), "
+            "press inside the grid of markers, track and fit again",
+        )
     if fit.creep_deviation is None:
         table.add_row("creep", "not found, or not determined: needs forces over time, with fast changes")
     else:
@@ -81,4 +88,5 @@ def _table(fit: GelFit, images: int, files: list[Path]) -> Table:
 def _factor_text(factor: Factor | None) -> str:
     if factor is None:
         return "not measured"
-    return f"{factor.value:.3f} ± {factor.deviation:.3f} times the estimates"
+    text = f"{factor.value:.3f} ± {factor.deviation:.3f} times the estimates"
+    return text if factor.scatter is None else f"{text}; contacts differ by {100 * factor.scatter:.0f} %"
