@@ -338,12 +338,9 @@ class Simulator(StateArrays):
     def _along_time(self, name: str, start: ArrayLike | None, steps: int, out: Trajectory | None) -> NDArray[Any]:
         """A part of the state over a rollout, in a new array or that of `out`, with its initial value."""
         present = getattr(self, name)
-        if out is None:  # zeros: the core writes only the anchors that are set
-            array: NDArray[Any] = np.zeros((steps + 1, *present.shape), present.dtype)
-        else:
-            array = getattr(out, name)
-            if name == "anchors":
-                array[1:] = 0
+        array = np.zeros((steps + 1, *present.shape), present.dtype) if out is None else getattr(out, name)
+        if out is not None and name == "anchors":
+            array[1:] = 0  # the core writes only the anchors that are set
         fill(name, array[0], present if start is None else start)
         return array
 

@@ -21,8 +21,8 @@ Array = NDArray[np.float64]
 
 # Error of one contact that more images of it do not reduce, relative; see docs/guide/sensing/forces.md.
 _CONTACT_ERROR = {"normal": 0.06, "shear": 0.015}
-# Scatter of the normal factors above which the thickness is doubtful: in 12 calibrations from five contacts each it is .01
-# to .05 with the right thickness, and .05 to .5 (all but one above .08) with one that is wrong by half.
+# Scatter of the normal factors above which the thickness is doubtful: in 12 calibrations from five contacts each it is
+# .01 to .05 with the right thickness, and .05 to .5 (all but one above .08) with one that is wrong by half.
 _DOUBTFUL_SCATTER = 0.08
 _DOUBT = 2.0  # deviation of the modulus / scatter, where the thickness is doubtful
 _SMALLEST = 0.1  # share of the largest measured force below which an image is not used

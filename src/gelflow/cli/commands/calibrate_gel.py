@@ -72,8 +72,8 @@ def _table(fit: GelFit, images: int, files: list[Path]) -> Table:
     elif fit.doubtful:
         table.add_row(
             "thickness",
-            f"doubtful: the normal forces of the contacts disagree. Measure it ({1e3 * gel.thickness:.2f} mm is stated), "
-            "press inside the grid of markers, track and fit again",
+            "doubtful: the normal forces of the contacts disagree. Measure it "
+            f"({1e3 * gel.thickness:.2f} mm is stated), press inside the grid of markers, track and fit again",
         )
     if fit.creep_deviation is None:
         table.add_row("creep", "not found, or not determined: needs forces over time, with fast changes")
