@@ -17,7 +17,7 @@ from gelflow.clock import ScaledClock
 from gelflow.protocols import CameraImage
 from gelflow.session import SessionRecorder
 
-MAIN = [sys.executable, "-c", "import sys; from gelflow.cli.main import main; sys.exit(main(sys.argv[1:]))"]
+MAIN = [sys.executable, "-m", "gelflow.cli"]
 COMMON_OPTIONS = {
     "train": {"--json", "--out", "--seed", "--preset"},
     "sweep": {"--json", "--out"},

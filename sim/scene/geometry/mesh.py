@@ -119,12 +119,13 @@ def nearest_points(mesh: TriangleMesh, points: Array, name: str) -> Array:
 def with_progress(label: str, items: Sequence[T]) -> Iterator[T]:
     """Iterate over items; after two seconds a progress bar is shown on the terminal."""
     from rich.console import Console
+    from rich.markup import escape
     from rich.progress import Progress
 
     console = Console(stderr=True)
     start = time.monotonic()
     with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task(label, total=len(items), visible=False)
+        task = bar.add_task(escape(label), total=len(items), visible=False)
         for item in items:
             yield item
             bar.update(task, advance=1, visible=time.monotonic() - start > _PROGRESS_DELAY)

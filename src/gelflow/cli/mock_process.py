@@ -38,12 +38,12 @@ def mock_robot(*, factor: float, seed: int, preset: str | None = None, **more: o
             "--egm-port": free_port(socket.SOCK_DGRAM),
         }
         options |= {f"--{name}": value for name, value in {"preset": preset, **more}.items() if value is not None}
-        code = "import sys; from gelflow.cli.main import main; sys.exit(main(sys.argv[1:]))"
         process = subprocess.Popen(
             [
                 sys.executable,
-                "-c",
-                code,
+                "-P",
+                "-m",
+                "gelflow.cli",
                 "mock",
                 "--attached",
                 *(str(word) for pair in options.items() for word in pair),
