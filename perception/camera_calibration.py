@@ -340,7 +340,7 @@ def load_calibration(path: str | Path) -> CameraCalibration:
         raise UsageError(
             f"cannot read {path}: {error.strerror}; gelflow calibrate-camera creates such a file"
         ) from None
-    except ValueError:  # of JSON and of UTF-8
+    except (ValueError, RecursionError):  # of JSON and of UTF-8
         raise UsageError(f"{path} is not a calibration: invalid JSON; gelflow calibrate-camera creates one") from None
     written = data.pop("format", None) if isinstance(data, dict) else None
     if type(written) is not int:

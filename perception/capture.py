@@ -21,6 +21,7 @@ Image = NDArray[np.uint8]
 _JPEG = b"\xff\xd8\xff"
 _PORTS = {"http": 80, "https": 443, "rtsp": 554, "rtmp": 1935}  # default ports of the protocols over TCP
 _MISSING, _MISSING_SHARE = 2, 0.02  # images at the end of a video that its container may announce in excess
+_LARGEST_INT = 2**31 - 1  # of OpenCV, a number that no camera has
 _BACKLOG = 8  # live images that wait for the program
 # Silences FFmpeg; OpenCV reads the variable at the first use of FFmpeg.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
@@ -145,7 +146,7 @@ class Capture:
         return capture
 
     def _open_camera(self) -> cv2.VideoCapture:
-        capture = cv2.VideoCapture(int(self.text))
+        capture = cv2.VideoCapture(min(int(self.text), _LARGEST_INT))
         if any(self.size):
             # Large images come at full rate only as JPEG, which is then decoded at the size that is needed.
             capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*"MJPG"))

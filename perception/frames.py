@@ -254,7 +254,10 @@ def reduce_image(image: Image, reduce: Reduction) -> Image:
 
 def _decoded(data: bytes, flags: int) -> NDArray[np.uint8 | np.uint16]:
     """The decoded image. Raises UnreadableImage when there is none."""
-    image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags) if data else None
+    try:
+        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags) if data else None
+    except cv2.error:  # a damaged header claims more pixels than OpenCV accepts
+        image = None
     if image is None or image.dtype not in (np.uint8, np.uint16):
         problem = f"do not start like one (first bytes: {data[:8].hex(' ') or 'none'})"
         if data.startswith(ENCODED):

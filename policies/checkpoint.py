@@ -3,6 +3,7 @@
 A checkpoint is one safetensors file with a JSON header. Reading it executes no code of the file and needs no torch.
 """
 
+import contextlib
 import hashlib
 import json
 import os
@@ -88,11 +89,16 @@ def save_checkpoint(
 def replace_file(path: Path, data: bytes) -> None:
     """Writes a file as a whole: a process that is killed meanwhile leaves the previous file intact."""
     partial = path.with_name(path.name + ".part")
-    with partial.open("wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    partial.replace(path)
+    try:
+        with partial.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(path)
+    except OSError:
+        with contextlib.suppress(OSError):
+            partial.unlink(missing_ok=True)
+        raise
 
 
 def load_checkpoint(path: Path) -> Checkpoint:

@@ -26,6 +26,8 @@ _CONTACT_ERROR = {"normal": 0.06, "shear": 0.015}
 _DOUBTFUL_SCATTER = 0.08
 _DOUBT = 2.0  # deviation of the modulus / scatter, where the thickness is doubtful
 _SMALLEST = 0.1  # share of the largest measured force below which an image is not used
+_LARGEST_FORCE = 1e5  # measured force [N]: larger ones have another unit
+_LARGEST_FACTOR = 1000.0  # measured / estimated force, or estimated / measured
 _FEWEST = 3  # images with contact and measured force
 _LAG_ERROR = 0.05  # of the modulus, relative to the creep
 _LAG_IMAGES = 30  # fewer do not determine a lag
@@ -100,6 +102,8 @@ def read_samples(estimates: Path, measured: Path) -> ForceSamples:
     data = np.array(kept).reshape(-1, 6)
     data = data[np.isfinite(data[:, 4:]).any(1)]
     for name, forces in (("normal_n", data[:, 4]), ("shear_n", data[:, 5])):
+        if (largest := np.nanmax(np.abs(forces), initial=0.0)) > _LARGEST_FORCE:
+            raise UsageError(f"{measured}: {name} is {largest:.3g}; forces are in newtons")
         if np.nansum(forces) < 0:
             raise UsageError(f"{measured}: {name} is negative during contact; forces count positive: change its sign")
     if len(data) < _FEWEST:
@@ -131,6 +135,11 @@ def fit_gel(samples: ForceSamples, gel: ElasticGel) -> GelFit:
     found = [factor for factor in (normal, shear) if factor is not None]
     if not found:
         raise UsageError("no image has a measured and an estimated force above 0: press harder, or check the units (N)")
+    for factor in found:
+        if not 1 / _LARGEST_FACTOR < factor.value < _LARGEST_FACTOR:
+            raise UsageError(
+                f"measured forces are {factor.value:.3g} times the estimates; are they in newtons, the modulus in Pa?"
+            )
     weights = np.array([factor.deviation for factor in found]) ** -2.0
     scale = float(weights @ [factor.value for factor in found] / weights.sum())
     deviation = math.hypot(float(weights.sum() ** -0.5) / scale, _LAG_ERROR * creep)
@@ -246,7 +255,10 @@ def _measurements(table: list[dict[str, str]], name: str, path: Path, *, in_time
         if (np.diff(stamps) <= 0).any():
             raise UsageError(f"{path}: stamps must increase")
         return _Measurements(stamps, values, {})
-    return _Measurements(None, values, dict(zip((row["image"] for row in rows), values.tolist(), strict=True)))
+    names = [row["image"] for row in rows]
+    if twice := {image for image in names if names.count(image) > 1}:
+        raise UsageError(f"{path}: {name} of {min(twice)} is there twice; keep one of them")
+    return _Measurements(None, values, dict(zip(names, values.tolist(), strict=True)))
 
 
 @dataclass(frozen=True)
@@ -264,12 +276,16 @@ class _Measurements:
 def _read(path: Path, needed: tuple[str, ...]) -> list[dict[str, str]]:
     try:
         with path.open(encoding="utf-8-sig", newline="") as text:  # spreadsheets write a byte-order mark
-            rows = list(csv.DictReader(text))
+            table = csv.DictReader(text)
+            rows = list(table)
+            names = list(table.fieldnames or ())
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise UsageError(f"cannot read {path}: {error}") from None
     for number, row in enumerate(rows, start=1):
         if any(row.pop(None, ())):
             raise UsageError(f"{path}: row {number} has more cells than the header; a number has a decimal point")
+    if twice := {name for name in names if name and names.count(name) > 1}:
+        raise UsageError(f"{path} has the column {', '.join(sorted(twice))} twice; keep one of them")
     missing = [name for name in needed if rows and name not in rows[0]]
     if not rows or missing:
         raise UsageError(f"{path} is not a table of forces: {'it has no rows' if not rows else f'no {missing[0]}'}")

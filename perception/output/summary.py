@@ -22,6 +22,7 @@ class TrackingSummary:
     """Statistics over the images of a run; stores no image."""
 
     images: int = 0
+    complete: bool = False  # the run did not end with an error; otherwise the files may be incomplete
     seconds: list[float] = field(default_factory=list)  # tracking time of each image [s]
     largest: float = -1.0  # displacement [px]
     largest_mm: float | None = None
@@ -81,6 +82,7 @@ class TrackingSummary:
         assert self.first is not None
         return {
             "images": self.images,
+            "complete": self.complete,
             "rows": self.first.rows,
             "cols": self.first.cols,
             "spacing_px": self.first.spacing,

@@ -85,7 +85,7 @@ def read_randomization(path: Path, task: InsertionTask) -> dict[str, Any]:
             }
     except OSError as error:
         raise UsageError(f"cannot read the calibration {path}: {error.strerror}") from error
-    except (ValueError, KeyError, TypeError, AttributeError):
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         raise UsageError(f"{path} is not the report.json of gelflow calibrate") from None
     if number != FORMAT:
         raise UsageError(f"{path}: format must be {FORMAT}, got {number!r}; repeat gelflow calibrate")

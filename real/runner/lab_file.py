@@ -1,5 +1,6 @@
 """Reads and writes lab files."""
 
+import contextlib
 import dataclasses
 import json
 from pathlib import Path
@@ -59,4 +60,6 @@ def save_lab(lab: Lab, path: str | Path, *, title: str) -> None:
         partial.write_text("\n".join(lines) + "\n", encoding="utf-8")
         partial.replace(path)
     except OSError as error:
+        with contextlib.suppress(OSError):
+            partial.unlink(missing_ok=True)
         raise UsageError(f"cannot write {path}: {error.strerror}") from None

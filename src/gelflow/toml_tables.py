@@ -24,7 +24,9 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise UsageError(f"no such file: {path}") from None
     except OSError as error:
         raise UsageError(f"cannot read {path}: {error.strerror}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except RecursionError:
+        raise UsageError(f"{path} is not valid TOML: its lists or tables are nested too deeply") from None
+    except ValueError as error:  # also text that is not UTF-8, and integers with thousands of digits
         raise UsageError(f"{path} is not valid TOML: {error}") from None
 
 
@@ -113,7 +115,7 @@ class TomlTable:
     def number(self, key: str, default: float | None = None, *, minimum: float = -math.inf) -> float:
         """A finite number ≥ `minimum`. A key without a default is required; this holds for all methods below."""
         value = self._get(key, default)
-        if not _is_number(value) or not math.isfinite(value) or value < minimum:
+        if not _is_finite(value) or value < minimum:
             bound = "" if minimum == -math.inf else f" ≥ {minimum:g}"
             raise UsageError(f"{self.location}: {key} must be a finite number{bound}, got {value!r}")
         return float(value)
@@ -154,8 +156,7 @@ class TomlTable:
     def numbers(self, key: str, count: int, default: Sequence[float] | None = None) -> tuple[float, ...]:
         """A list of `count` finite numbers."""
         value = self._get(key, default)
-        valid = isinstance(value, list | tuple) and len(value) == count and all(map(_is_number, value))
-        if not valid or not all(map(math.isfinite, value)):
+        if not isinstance(value, list | tuple) or len(value) != count or not all(map(_is_finite, value)):
             raise UsageError(f"{self.location}: {key} must be {count} finite numbers, got {value!r}")
         return tuple(float(v) for v in value)
 
@@ -220,5 +221,8 @@ class TomlTable:
         return value
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
+def _is_finite(value: Any) -> bool:
+    try:
+        return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    except OverflowError:  # an integer that is too large for a float
+        return False

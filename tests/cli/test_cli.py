@@ -190,6 +190,31 @@ def test_a_full_disk_is_an_error_of_one_line(
     assert capsys.readouterr().err == "gelflow recover: cannot write runs/x: No space left on device\n"
 
 
+LONG = 300 * "a"
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["track", LONG],
+        ["calibrate-camera", LONG, "--spacing-mm", "1.4"],
+        ["recover", f"{LONG}.mcap"],
+        ["describe", LONG],
+        ["export", LONG],
+        ["render", "--frames", "2", "--out", LONG],
+        ["eval", "insertion", "--part", LONG],
+        ["calibrate", "--plan", LONG],
+    ],
+    ids=lambda arguments: arguments[0],
+)
+def test_a_name_that_is_too_long_is_an_error_of_one_line(
+    arguments: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(arguments) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"gelflow {arguments[0]}: ") and "File name too long" in error and error.count("\n") == 1
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

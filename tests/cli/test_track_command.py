@@ -133,10 +133,34 @@ def test_a_killed_run_leaves_readable_files(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["t.csv", "o.mkv", "o.avi", "o.mp4", "s.mcap"])
 def test_a_full_disk_is_an_error(name: str, tmp_path: Path) -> None:
     full = [*MAIN[:2], f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (30000, 30000)); {MAIN[2]}"]
-    words = ["track", str(draw(tmp_path / "images", 40)), "--out", str(tmp_path / name)]
+    words = ["track", str(draw(tmp_path / "images", 40)), "--json", "--out", str(tmp_path / name)]
     run = subprocess.run([*full, *words], capture_output=True, text=True)
     assert run.returncode == 2 and "Traceback" not in run.stderr
+    result = json.loads(run.stdout)
+    assert not result["complete"]
+    assert all(Path(file).stat().st_size for file in result["files"])
+    assert all(file.stat().st_size for file in tmp_path.iterdir())
     assert name in run.stderr.splitlines()[-1]  # OpenCV writes warnings before
+
+
+def test_a_picture_that_cannot_be_written_leaves_no_calibration(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(*arguments: object) -> None:
+        raise UsageError("cannot write the picture: No space left on device")
+
+    command = ["calibrate-camera", str(draw(tmp_path / "images", 1)), "--spacing-mm", "2.2"]
+    command += ["--out", str(tmp_path / "left.json")]
+    with monkeypatch.context() as patch:
+        patch.setattr("gelflow.cli.commands.calibrate_camera.draw_calibration", full)
+        assert main(command) == 2
+    assert "No space left" in capsys.readouterr().err and not (tmp_path / "left.json").exists()
+    assert main(command) == 0 and (tmp_path / "left.png").exists()
+
+
+def test_a_camera_number_beyond_all_cameras_is_an_error() -> None:
+    status, error = track("99999999999")
+    assert status == 2 and "camera 99999999999 cannot be opened" in error and "Traceback" not in error
 
 
 def test_a_recording_waits_for_a_slow_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

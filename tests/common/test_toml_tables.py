@@ -69,6 +69,21 @@ def test_numbers_must_be_finite_and_above_the_minimum() -> None:
         TABLE.number("x", minimum=1)
 
 
+def test_integers_beyond_a_float_are_no_finite_numbers() -> None:
+    huge = TomlTable({"n": 10**400, "sizes": [1, 10**400]}, "file.toml")
+    with pytest.raises(UsageError, match="n must be a finite number"):
+        huge.number("n")
+    with pytest.raises(UsageError, match="sizes must be 2 finite numbers"):
+        huge.numbers("sizes", 2)
+
+
+@pytest.mark.parametrize("text", ["n = 1" + 5000 * "0", "n = " + 3000 * "[" + 3000 * "]"], ids=["digits", "nested"])
+def test_what_the_parser_cannot_hold_is_no_valid_toml(tmp_path: Path, text: str) -> None:
+    (tmp_path / "odd.toml").write_text(text)
+    with pytest.raises(UsageError, match="is not valid TOML"):
+        read_toml(tmp_path / "odd.toml")
+
+
 def test_unknown_and_renamed_keys() -> None:
     valid = ("n", "x", "names", "on", "sizes", "sub")
     with pytest.raises(UsageError, match="unknown key 'name'; did you mean 'names'"):

@@ -103,6 +103,16 @@ def test_a_truncated_image_is_reported_as_truncated() -> None:
         decode_image(data[: len(data) // 2])
 
 
+def test_a_damaged_header_with_too_many_pixels_is_an_unreadable_image() -> None:
+    renderer = FastGelRenderer()
+    data = bytearray(renderer.encode(renderer.render(np.zeros((252, 2)))))
+    size = data.find(b"\xff\xc0") + 5
+    data[size] |= 0x80
+    data[size + 2] |= 0x80
+    with pytest.raises(PeerError, match="truncated or damaged"):
+        decode_image(bytes(data))
+
+
 @pytest.mark.parametrize(("bits", "suffix"), [(10, ".png"), (12, ".png"), (12, ".tiff"), (12, ".pgm"), (16, ".png")])
 def test_images_of_16_bits_are_reduced_by_the_bits_that_the_first_one_uses(bits: int, suffix: str) -> None:
     bright = np.linspace(0, (1 << bits) - 1, 3072).reshape(48, 64)

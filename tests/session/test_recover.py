@@ -168,8 +168,9 @@ def test_records_that_cannot_be_decoded_are_passed_over_and_counted(tmp_path: Pa
     damage = Damage()
     with SessionReader(tmp_path / "odd.mcap") as reader:
         assert [record.topic for record in reader.records(damage=damage)] == ["/event", "/event", "/other/timing"]
-        with pytest.raises(PeerError, match="is damaged"):
+        with pytest.raises(PeerError, match="is damaged: a record of /event cannot be read") as caught:
             list(reader.records())
+        assert "gelflow recover" not in str(caught.value)  # which would copy it as it is
     assert (damage.chunks, damage.records) == (0, 3)
 
 
@@ -220,6 +221,27 @@ def test_undamaged_files_and_wrong_paths_are_rejected(tmp_path: Path) -> None:
         recover(path, tmp_path / "no folder" / "new.mcap")
     with pytest.raises(UsageError, match="cannot write"):
         recover(path, tmp_path / "text" / "new.mcap")
+
+
+def test_no_other_file_is_replaced(tmp_path: Path) -> None:
+    """Neither that of another recovery, nor a link to nowhere."""
+    path = make(tmp_path / "session.mcap", messages=3)
+    path.write_bytes(path.read_bytes()[:-50])
+    (tmp_path / "saved.mcap.part").write_text("of another recovery")
+    with pytest.raises(UsageError, match=r"saved\.mcap\.part exists: another recovery writes it"):
+        recover(path, tmp_path / "saved.mcap")
+    assert (tmp_path / "saved.mcap.part").read_text() == "of another recovery"
+    (tmp_path / "link.mcap").symlink_to(tmp_path / "nowhere" / "x")
+    with pytest.raises(UsageError, match=r"link\.mcap exists"):
+        recover(path, tmp_path / "link.mcap")
+    assert (tmp_path / "link.mcap").is_symlink()
+
+
+def test_a_name_with_spaces_is_quoted_in_the_advice(tmp_path: Path) -> None:
+    path = make(tmp_path / "my session [1].mcap", messages=3)
+    path.write_bytes(path.read_bytes()[:-50])
+    with pytest.raises(PeerError, match=r"gelflow recover '.*my session \[1\]\.mcap'"):
+        SessionReader(path).open()
 
 
 def test_a_session_in_progress_is_rejected(tmp_path: Path) -> None:

@@ -120,10 +120,12 @@ def _run(arguments: Sequence[str], requested: str) -> int:
         print(f"gelflow {args.command}: {text}", file=sys.stderr)
         return ERROR
     except OSError as error:
-        if error.errno not in _DISK_FULL:
+        full = error.errno in _DISK_FULL
+        if not full and error.filename is None:
             raise
         name = "" if error.filename is None else f" {error.filename}"
-        print(f"gelflow {args.command}: cannot write{name}: {error.strerror}", file=sys.stderr)
+        verb = "write" if full else "use"
+        print(f"gelflow {args.command}: cannot {verb}{name}: {error.strerror}", file=sys.stderr)
         return ERROR
     except Interrupted as interrupt:
         with contextlib.suppress(OSError):  # after SIGHUP the terminal is gone

@@ -1,8 +1,10 @@
 """Command-line options that several commands share. An option has the same meaning in every command."""
 
 import argparse
+import contextlib
 import os
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 from gelflow.errors import UsageError
@@ -36,6 +38,26 @@ def check_new_file(file: Path, *, suffixes: tuple[str, ...] = ()) -> None:
         raise UsageError(f"{file} exists; name a new file with --out")
     if not file.parent.is_dir():
         raise UsageError(f"{file}: the folder {file.parent} does not exist")
+
+
+@contextlib.contextmanager
+def removed_on_error(*files: Path) -> Iterator[None]:
+    """Delete the new files that the context created if it raises: the same command can then be repeated."""
+    new = [file for file in files if not os.path.lexists(file)]
+    try:
+        yield
+    except BaseException:
+        for file in new:
+            with contextlib.suppress(OSError):
+                file.unlink()
+        raise
+
+
+def has_content(file: Path) -> bool:
+    """Whether a new file was written; an empty one, as of a full disk, is deleted."""
+    if file.is_file() and not file.stat().st_size:
+        file.unlink()
+    return file.is_file()
 
 
 def picture_beside(file: Path) -> Path:

@@ -3,6 +3,7 @@
 import dataclasses
 import fcntl
 import json
+import shlex
 import threading
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
@@ -132,7 +133,7 @@ class SessionReader:
                 record = self._record(channel.topic, message, camera_times)
             except (*READ_ERRORS, PeerError) as error:
                 if damage is None:
-                    raise self._damaged(error) from error
+                    raise self._unreadable(channel.topic, error) from error
                 continue
             good += 1
             if topics is None or record.topic in topics:
@@ -166,7 +167,7 @@ class SessionReader:
         try:
             return self._record(topic, message, {})
         except READ_ERRORS as error:
-            raise self._damaged(error) from error
+            raise self._unreadable(topic, error) from error
 
     def robot_time(self, nanoseconds: int) -> float:
         """A log time of the file as robot time [s]."""
@@ -209,11 +210,24 @@ class SessionReader:
     def _unfinished(self, stream: BinaryIO) -> str:
         if is_being_recorded(stream):
             return f"{self.path} is still being recorded; wait until the recorder has closed it"
-        return f"{self.path} is not finished, its recorder was killed; recover it with: gelflow recover {self.path}"
+        return f"{self.path} is not finished, its recorder was killed; recover it with: {self._recovery}"
+
+    @property
+    def _recovery(self) -> str:
+        return f"gelflow recover {shlex.quote(str(self.path))}"
 
     def _damaged(self, error: BaseException) -> PeerError:
-        cause = " ".join(f"{type(error).__name__} {error}".split())[:120]
-        return PeerError(f"{self.path} is damaged ({cause}); recover it with: gelflow recover {self.path}")
+        return PeerError(f"{self.path} is damaged ({_cause(error)}); recover it with: {self._recovery}")
+
+    def _unreadable(self, topic: str, error: BaseException) -> PeerError:
+        """For a record whose contents no recovery changes."""
+        return PeerError(
+            f"{self.path} is damaged: a record of {topic} cannot be read ({_cause(error)}); another program wrote it?"
+        )
+
+
+def _cause(error: BaseException) -> str:
+    return " ".join(f"{type(error).__name__} {error}".split())[:120]
 
 
 def open_recording(path: Path) -> BinaryIO:

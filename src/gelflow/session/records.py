@@ -77,11 +77,18 @@ def from_plain(kind: type[Record], data: Any, *, what: str) -> Record:
         extra = f"unknown keys {sorted(set(data) - names)}" if isinstance(data, Mapping) else f"{data!r}"
         known = ", ".join(sorted(names))
         raise UsageError(f"{what}: expected the keys {known}, got {extra}; was it written by another version?")
+    required = {f.name for f in dataclasses.fields(kind) if _is_required(f)}  # type: ignore[arg-type]
+    if missing := sorted(required - set(data)):
+        raise UsageError(f"{what}: {', '.join(missing)} missing; was it written by another program?")
     fields = typing.get_type_hints(kind)
     try:
         return kind(**{key: _field(fields[key], value, f"{what}, {key}") for key, value in data.items()})
     except (TypeError, ValueError) as error:
         raise UsageError(f"{what}: {error}") from error
+
+
+def _is_required(field: "dataclasses.Field[Any]") -> bool:
+    return field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
 
 
 def described(kind: type[Record], description: Mapping[str, Any], key: str, *, what: str) -> list[Record]:

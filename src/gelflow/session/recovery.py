@@ -41,30 +41,48 @@ def recover(source: str | Path, target: str | Path) -> RecoveryReport:
     no complete message.
     """
     source, target = Path(source), Path(target)
-    if target.exists():
-        raise UsageError(f"{target} exists; name another file with --out")
-    partial = target.with_name(target.name + ".part")
+    _check_new(target)
     _check_not_whole(source)
     with open_recording(source) as stream:
         if is_being_recorded(stream):
             raise UsageError(f"{source} is still being recorded; wait until the recorder has closed it")
         try:
-            with partial.open("wb") as out:
-                copy = _Copy(out)
-                copy.take_summary(stream)
-                for opcode, data in _complete_records(stream, copy):
-                    copy.take(opcode, data)
-                copy.finish(source)
-            if copy.messages == 0:
-                raise PeerError(f"{source} contains no complete message; there is nothing to recover")
-            partial.replace(target)
+            copy = _copied(stream, source, target)
         except OSError as error:
             raise UsageError(f"cannot write {target}: {error.strerror}; use a writable folder") from error
-        finally:
-            with contextlib.suppress(OSError):
-                partial.unlink(missing_ok=True)
     span = (copy.last - copy.first) / 1e9
     return RecoveryReport(target, copy.messages, span, copy.lost, copy.damaged)
+
+
+def _check_new(target: Path) -> None:
+    if os.path.lexists(target):
+        raise UsageError(f"{target} exists; name another file with --out")
+
+
+def _copied(stream: BinaryIO, source: Path, target: Path) -> "_Copy":
+    """Write `target` by way of a file beside it, so that the name belongs to a complete file only."""
+    partial = target.with_name(target.name + ".part")
+    try:
+        out = partial.open("xb")
+    except FileExistsError:
+        raise UsageError(
+            f"{partial} exists: another recovery writes it, or was killed; name another file with --out, or delete it"
+        ) from None
+    try:
+        with out:
+            copy = _Copy(out)
+            copy.take_summary(stream)
+            for opcode, data in _complete_records(stream, copy):
+                copy.take(opcode, data)
+            copy.finish(source)
+        if copy.messages == 0:
+            raise PeerError(f"{source} contains no complete message; there is nothing to recover")
+        _check_new(target)
+        partial.replace(target)
+    finally:
+        with contextlib.suppress(OSError):
+            partial.unlink(missing_ok=True)
+    return copy
 
 
 def _check_not_whole(source: Path) -> None:

@@ -114,6 +114,10 @@ def test_contacts_that_disagree_make_the_thickness_doubtful(
         ("stamp,normal_n\n0,0\n9,0\n", "above 0"),
         ("stamp,normal_n\n0,-2\n9,-2\n", "normal_n is negative during contact"),
         ("stamp,normal_n\n0,1\n9,5,3\n", "row 2 has more cells"),
+        ("stamp,normal_n,normal_n\n0,1,5\n9,2,5\n", "has the column normal_n twice"),
+        ("image,normal_n\n10.jpg,1\n10.jpg,2\n", "normal_n of 10.jpg is there twice"),
+        ("stamp,normal_n\n0,1e300\n9,1e300\n", "normal_n is 1e.300; forces are in newtons"),
+        ("stamp,normal_n\n0,1e-300\n9,1e-300\n", "times the estimates; are they in newtons"),
     ],
 )
 def test_wrong_measurements_are_refused(layer: PressedLayer, tmp_path: Path, text: str, named: str) -> None:

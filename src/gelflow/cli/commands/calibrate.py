@@ -4,6 +4,7 @@ import argparse
 import dataclasses
 import math
 import os
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -145,7 +146,8 @@ def _write_plan(
     save_motion_plan(plan.motions, args.plan, title=f"Written by gelflow calibrate --plan for {known}.")
     for line in _plan_lines(plan):
         output.text(line)
-    output.text(f"the plan is {args.plan}; record it with: gelflow run insertion --lab LAB --plan {args.plan}")
+    name = shlex.quote(str(args.plan))
+    output.text(f"the plan is {args.plan}; record it with: gelflow run insertion --lab LAB --plan {name}")
     return [dataclasses.asdict(motion) | {"gain": gain} for motion, gain in zip(plan.motions, plan.gains, strict=True)]
 
 

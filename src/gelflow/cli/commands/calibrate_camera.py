@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from rich.table import Table
 
 from gelflow.cli.exit_codes import SUCCESS
-from gelflow.cli.options import add_json, add_out, add_profile, picture_beside
+from gelflow.cli.options import add_json, add_out, add_profile, picture_beside, removed_on_error
 from gelflow.cli.output import Output
 from gelflow.errors import PeerError, UsageError
 from gelflow.perception.camera_calibration import CameraCalibration, fit_calibration, save_calibration, scale_by_ruler
@@ -84,8 +84,9 @@ def run(args: argparse.Namespace) -> int:
             raise UsageError("the points of the ruler must be in the part of the image that the profile uses")
         fit = scale_by_ruler(fit, points, args.ruler[4], pixel=1 / profile.image.reduce)
     fit = replace(fit, skipped=part.skipped) if part else fit
-    save_calibration(fit, args.out)
-    draw_calibration(image, rest, measured, fit, picture)
+    with removed_on_error(args.out, picture):
+        save_calibration(fit, args.out)
+        draw_calibration(image, rest, measured, fit, picture)
     rejected = _rejected(fit, rest, measured)
     scale = fit.pixels_per_mm()
     if output.json:

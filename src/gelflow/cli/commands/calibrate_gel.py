@@ -7,7 +7,7 @@ from pathlib import Path
 from rich.table import Table
 
 from gelflow.cli.exit_codes import SUCCESS
-from gelflow.cli.options import add_json, add_out, picture_beside
+from gelflow.cli.options import add_json, add_out, picture_beside, removed_on_error
 from gelflow.cli.output import Output
 from gelflow.gel.gel_file import load_gel, save_gel
 from gelflow.perception.force.gel_fit import Factor, GelFit, fit_gel, read_samples
@@ -36,8 +36,9 @@ def run(args: argparse.Namespace) -> int:
     guess = load_gel(args.gel)
     samples = read_samples(args.estimates, args.measured)
     fit = fit_gel(samples, guess)
-    save_gel(fit.gel, args.out)
-    draw_gel_fit(samples, fit, fit.gel.youngs_modulus / guess.youngs_modulus, picture)
+    with removed_on_error(args.out, picture):
+        save_gel(fit.gel, args.out)
+        draw_gel_fit(samples, fit, fit.gel.youngs_modulus / guess.youngs_modulus, picture)
     if output.json:
         output.result(
             {

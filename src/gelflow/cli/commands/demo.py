@@ -2,6 +2,7 @@
 
 import argparse
 import math
+import shlex
 import sys
 import time
 from dataclasses import dataclass, field, replace
@@ -86,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
     if first.insertions:
         output.text(f"pictures of what the policy saw: {args.out}/insertion-*.png")
     output.text(f"the session is {session}; recompute its decisions with:")
-    output.text(f"  gelflow replay {session}")
+    output.text(f"  gelflow replay {shlex.quote(str(session))}")
     output.result(_to_json(session, results, evaluations))
     for result in results:
         if result.error is not None:

@@ -3,6 +3,7 @@
 import argparse
 import dataclasses
 import datetime
+import shlex
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -111,7 +112,8 @@ def run(args: argparse.Namespace) -> int:
     output.console.print(insertion_table(results))
     for line in warnings:
         output.text(f"warning: {line}")
-    then = f"replay it with: gelflow replay {session}" if args.plan is None else f"then: gelflow calibrate {session}"
+    name = shlex.quote(str(session))
+    then = f"replay it with: gelflow replay {name}" if args.plan is None else f"then: gelflow calibrate {name}"
     output.text(f"recorded: {session}; {then}")
     insertions = [insertion_to_json(result) for result in results]
     output.result({"session": session, "insertions": insertions, "warnings": warnings})

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rich.table import Table
 
 from gelflow.cli.exit_codes import SUCCESS
-from gelflow.cli.options import add_json, add_page_address, add_profile, check_at_least, check_new_file
+from gelflow.cli.options import add_json, add_page_address, add_profile, check_at_least, check_new_file, has_content
 from gelflow.cli.output import Output, progress_bar
 from gelflow.errors import UsageError
 from gelflow.gel.gel_file import ElasticGel, load_gel
@@ -111,14 +111,17 @@ def run(args: argparse.Namespace) -> int:
     try:
         with _page(args, output, live=source.live) as page:
             _track(source, calibration, summary, args, page)
+        summary.complete = True
     except KeyboardInterrupt:
         if not source.live or not summary.images:
             raise
+        summary.complete = True
     finally:
         # An error or Ctrl-C keeps the results of the images before it.
+        files = [file for file in args.out if has_content(file)]
         if summary.images:
             seconds, name = time.perf_counter() - begin, None if gel is None else gel.text
-            _show(output, summary, source.skipped, seconds, args.out, name)
+            _show(output, summary, source.skipped, seconds, files, name)
     return SUCCESS
 
 
@@ -378,7 +381,7 @@ def _show(
     speed = f"{1 / usual:.0f} a second tracked ({1e3 * usual:.2f} ms each, the first {1e3 * first:.0f} ms)"
     table.add_row("speed", f"{speed}, {summary.images / wall:.0f} a second with reading and writing")
     for file in files:
-        table.add_row("written", str(file))
+        table.add_row("written" if summary.complete else "incomplete", str(file))
     output.console.print(table)
 
 

@@ -5,6 +5,7 @@ recording to follow; `ended`, the last state in words. Messages to the run: `url
 """
 
 import os
+import shlex
 import sys
 import time
 from collections.abc import Sequence
@@ -76,7 +77,7 @@ class LivePage:
             time.sleep(_LAST_STATE)
 
     def _view_command(self) -> str:
-        return "" if self._path is None else f"  \nlook at it again: `gelflow view {self._path}`"
+        return "" if self._path is None else f"  \nlook at it again: `gelflow view {shlex.quote(str(self._path))}`"
 
     def _open(self, path: Path) -> None:
         """Show a recording once its first records are written."""
