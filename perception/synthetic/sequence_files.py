@@ -1,5 +1,6 @@
 """Rendered sequences on disk: a folder of JPEG images or an MJPEG video, with a ground-truth file."""
 
+import contextlib
 import dataclasses
 import json
 import zipfile
@@ -39,7 +40,8 @@ def truth_file(images: Path) -> Path:
 def write_sequence(sequence: GelSequence, out: Path) -> Iterator[int]:
     """Renders `sequence` to `out`, a new folder or, with suffix .mjpeg, a video; yields the number of images written.
 
-    The ground truth is written last. Raises UsageError when a file exists or cannot be written.
+    The ground truth is written last. Raises UsageError when a file exists or cannot be written; the images are then
+    deleted.
     """
     video = out.suffix == VIDEO
     if truth_file(out).exists() or (out.exists() and not (out.is_dir() and not any(out.iterdir()))):
@@ -65,6 +67,10 @@ def write_sequence(sequence: GelSequence, out: Path) -> Iterator[int]:
             made_from=json.dumps(dataclasses.asdict(sequence)),
         )
     except OSError as error:
+        written = [out] if video else [out / f"{number:06d}.jpg" for number in range(len(position) + 1)]
+        with contextlib.suppress(OSError):
+            for file in (*written, truth_file(out)):
+                file.unlink(missing_ok=True)
         raise UsageError(f"{out} cannot be written: {error.strerror}") from None
 
 

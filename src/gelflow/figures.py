@@ -1,5 +1,7 @@
 """Colours, logarithmic axes, flow maps and files of all figures."""
 
+import contextlib
+import os
 from pathlib import Path
 from typing import Any
 
@@ -56,10 +58,14 @@ def rasterize(figure: Any) -> NDArray[np.uint8]:
 
 
 def save(figure: Any, path: str | Path, *, dpi: int = 100, make_folder: bool = True) -> None:
-    """Write a matplotlib figure. Raises UsageError when the file cannot be written."""
+    """Write a matplotlib figure. Raises UsageError when the file cannot be written; a part of a new file is deleted."""
+    new = not os.path.lexists(path)
     try:
         if make_folder:
             Path(path).parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, dpi=dpi)
     except (OSError, ValueError) as error:  # ValueError: unknown format
+        if new:
+            with contextlib.suppress(OSError):
+                Path(path).unlink()
         raise UsageError(f"cannot write the picture {path}: {error}; name a .png in a writable folder") from error

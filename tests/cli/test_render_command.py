@@ -1,5 +1,6 @@
 """`gelflow render`: written files contain the rendered sequence; nothing is overwritten."""
 
+import errno
 from pathlib import Path
 
 import numpy as np
@@ -51,6 +52,18 @@ def test_wrong_input_is_an_error_of_one_line(
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", ["images", "images.mjpeg"])
+def test_a_full_disk_leaves_no_images(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*arguments: object, **values: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("numpy.savez_compressed", full)
+        assert main(["render", "--out", str(tmp_path / name), "--frames", "3"]) == 2
+    assert [file for file in tmp_path.rglob("*") if file.is_file()] == []
+    assert main(["render", "--out", str(tmp_path / name), "--frames", "3"]) == 0
 
 
 def test_existing_folders_are_not_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

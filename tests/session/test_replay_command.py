@@ -14,6 +14,7 @@ from mcap.writer import Writer
 from gelflow.cli.commands import replay
 from gelflow.cli.main import main
 from gelflow.clock import ScaledClock
+from gelflow.errors import UsageError
 from gelflow.observation import FlowMap, flow_map
 from gelflow.perception.frames import CameraMount, decode_image, tactile_frame
 from gelflow.perception.synthetic.appearance import GelAppearance
@@ -107,6 +108,18 @@ def test_the_command_reports_identical_decisions(
     assert "…" not in out  # the table fits into 80 columns
     drawn = cv2.imread(str(picture))
     assert drawn is not None and drawn.min() < 100 and drawn.shape[0] > 300
+
+
+def test_decisions_are_shown_where_the_picture_cannot_be_written(
+    real_session: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*arguments: object) -> None:
+        raise UsageError("cannot write the picture: No space left on device")
+
+    monkeypatch.setattr("gelflow.session.decision_picture.draw_comparisons", full)
+    assert main(["replay", str(real_session), "--out", str(tmp_path / "maps.png")]) == 2
+    printed = capsys.readouterr()
+    assert "all 3 decisions identical" in printed.out and "No space left" in printed.err
 
 
 def test_a_narrow_terminal_shortens_no_number(

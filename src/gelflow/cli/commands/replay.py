@@ -57,11 +57,18 @@ def run(args: argparse.Namespace) -> int:
         comparisons = replay_with_progress(session, task, perception, policy, damage=damage)
         latencies = _latencies(session, description)
     result = _Result(comparisons, total - len(comparisons), damage, notes, latencies)
-    if args.out and comparisons:
+    picture, failure = args.out if comparisons else None, None
+    if picture:
         from gelflow.session.decision_picture import draw_comparisons
 
-        draw_comparisons(comparisons, task.grid, args.out)
-    return _show(output, result, args.out if comparisons else None)
+        try:
+            draw_comparisons(comparisons, task.grid, picture)
+        except UsageError as error:  # the comparison is shown nevertheless
+            picture, failure = None, error
+    status = _show(output, result, picture)
+    if failure is not None:
+        raise failure
+    return status
 
 
 def _replay_in_simulation(args: argparse.Namespace) -> int:
