@@ -13,7 +13,7 @@ from typing import NamedTuple
 class MotionLimits:
     """Hardware ranges and default limits. Lengths [m], angles [°], times in robot time [s]."""
 
-    # WSG-50: hardware ranges; a lab file and the device itself may narrow them.
+    # WSG-50: hardware ranges; `WsgLimits` and the device itself may narrow them.
     gripper_width: tuple[float, float] = (0.0, 0.110)  # opening between the fingers [m]
     gripper_speed: tuple[float, float] = (0.005, 0.420)  # [m/s]
     gripper_force: tuple[float, float] = (5.0, 80.0)  # grasping force [N]

@@ -8,7 +8,7 @@ __version__ = "0.1.0"
 
 # Packages are imported on first use, so that `import gelflow` stays fast.
 __getattr__, __dir__, __all__ = _lazy.attach(
-    __name__, submodules=["hardware_mocks", "perception", "policies", "real", "session", "sim"]
+    __name__, submodules=["gel", "hardware_mocks", "perception", "policies", "real", "session", "sim", "view"]
 )
 
 _register_when_imported()

@@ -1,6 +1,6 @@
 """Forces on the pads during a run: estimated in a helper process from the tracked images, and recorded.
 
-Nothing waits for an estimate: the observer passes on its results after the decisions that they lead to, a thread sends
+No decision waits for an estimate: the observer passes on its results after the decisions that they lead to, a thread sends
 the newest one of each pad to the helper, and results that arrive meanwhile replace those that wait.
 """
 

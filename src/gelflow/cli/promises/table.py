@@ -112,7 +112,7 @@ _TOUCHED = (
         ("tests/real/runner/touch/test_grasp_check.py::test_pad_that_does_not_show_the_weight_is_refused",),
     ),
     Promise(
-        "release", "an insertion is not believed when no pad shows the release",
+        "release", "a part is not counted as inserted unless both pads show a change at the release",
         "parts called inserted", 0.0, "",
         refusals.release_without_change,
         (
