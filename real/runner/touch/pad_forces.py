@@ -1,7 +1,7 @@
 """Forces on the pads during a run: estimated in a helper process from the tracked images, and recorded.
 
-No decision waits for an estimate: the observer passes on its results after the decisions that they lead to, a thread sends
-the newest one of each pad to the helper, and results that arrive meanwhile replace those that wait.
+No decision waits for an estimate: the observer passes on its results after the decisions that they lead to, a thread
+sends the newest one of each pad to the helper, and results that arrive meanwhile replace those that wait.
 """
 
 import contextlib
