@@ -6,8 +6,10 @@ break must not be repeated: the caller decides. Every packet is sent in one writ
 
 import contextlib
 import errno
+import os
 import socket
 import time
+from collections.abc import Callable
 from typing import Protocol
 
 import serial
@@ -96,19 +98,15 @@ class TcpTransport:
 
     def write(self, data: bytes) -> None:
         connection = self._connected()
+        # Reader and writer threads share the socket's time-out: poll instead of setting it.
         try:
-            # Reader and writer threads share the socket's time-out: poll instead of setting it.
-            deadline = time.monotonic() + _wall(self._clock, self._write_timeout)
-            view = memoryview(data)
-            while view:
-                sent = _send_some(connection, view)
-                view = view[sent:]
-                if view and time.monotonic() > deadline:
-                    raise PeerTimeout(f"{self.address} accepted no data for {self._write_timeout} s")
-                if not sent:
-                    time.sleep(1e-3)
+            accepted = _send_all(
+                lambda rest: connection.send(rest, socket.MSG_DONTWAIT), data, _wall(self._clock, self._write_timeout)
+            )
         except OSError as error:
             raise PeerError(f"the connection to {self.address} broke ({error.strerror or error})") from None
+        if not accepted:
+            raise PeerTimeout(f"{self.address} accepted no data for {self._write_timeout} s")
 
     def close(self) -> None:
         if self._socket is not None:
@@ -161,7 +159,6 @@ class SerialTransport:
                 self._path,
                 self._baudrate,
                 timeout=0.05,
-                write_timeout=_wall(self._clock, self._write_timeout),
                 exclusive=True,  # two programs on one line read each other's replies
             )
         except (serial.SerialException, OSError, ValueError) as error:
@@ -179,12 +176,15 @@ class SerialTransport:
 
     def write(self, data: bytes) -> None:
         line = self._connected()
+        # Not by pyserial: after a write it waits for the next one, and reports data that were accepted as refused when
+        # this program was stopped meanwhile.
         try:
-            line.write(data)
-        except serial.SerialTimeoutException:
-            raise PeerTimeout(f"{self._path} accepted no data for {self._write_timeout} s") from None
+            descriptor = line.fileno()
+            accepted = _send_all(lambda rest: os.write(descriptor, rest), data, _wall(self._clock, self._write_timeout))
         except (serial.SerialException, OSError, TypeError) as error:
             raise PeerError(f"the line {self._path} broke ({_serial_reason(error)})") from None
+        if not accepted:
+            raise PeerTimeout(f"{self._path} accepted no data for {self._write_timeout} s")
 
     def close(self) -> None:
         if self._serial is not None:
@@ -216,11 +216,26 @@ def _wall(clock: Clock, seconds: float) -> float:
     return max(clock.wall(seconds), SHORTEST_WALL_TIMEOUT)
 
 
-def _send_some(connection: socket.socket, data: memoryview) -> int:
-    try:
-        return connection.send(data, socket.MSG_DONTWAIT)
-    except (BlockingIOError, InterruptedError, TimeoutError):
-        return 0
+def _send_all(send: Callable[[memoryview], int], data: bytes, limit: float) -> bool:
+    """Pass all of `data` to `send`, which returns the number of bytes that it accepted and does not wait.
+
+    False when the peer has not accepted all within `limit` [s, wall]. The limit is compared before an attempt, which
+    follows also after it: time in which this program was stopped is no refusal.
+    """
+    deadline = time.monotonic() + limit
+    rest = memoryview(data)
+    while rest:
+        late = time.monotonic() > deadline
+        try:
+            sent = send(rest)
+        except (BlockingIOError, InterruptedError, TimeoutError):
+            sent = 0
+        rest = rest[sent:]
+        if rest and late:
+            return False
+        if not sent:
+            time.sleep(1e-3)
+    return True
 
 
 def _serial_reason(error: Exception) -> str:
