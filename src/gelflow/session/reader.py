@@ -222,7 +222,8 @@ class SessionReader:
     def _unreadable(self, topic: str, error: BaseException) -> PeerError:
         """For a record whose contents no recovery changes."""
         return PeerError(
-            f"{self.path} is damaged: a record of {topic} cannot be read ({_cause(error)}); another program wrote it?"
+            f"{self.path} is damaged: a record of {topic} cannot be read ({_cause(error)}); "
+            "was it written by another program?"
         )
 
 

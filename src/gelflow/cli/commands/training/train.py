@@ -65,7 +65,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     add_part(insertion)
     insertion.add_argument(
-        "--calibration", type=Path, metavar="FILE", help="report.json of gelflow calibrate, with physical parameters"
+        "--calibration", type=Path, metavar="FILE", help="report.json of gelflow calibrate: the physical parameters"
     )
     insertion.add_argument(
         "--start", type=Path, nargs="?", const=_SHIPPED, metavar="FILE",
