@@ -46,7 +46,7 @@ test: core
 	@.venv/bin/python -m pytest $(PARALLEL)
 
 test-slow: core
-	@.venv/bin/python -m pytest $(PARALLEL) -m slow
+	@.venv/bin/python -m pytest $(PARALLEL) -m slow -v
 
 check: core
 	.venv/bin/ruff check .
