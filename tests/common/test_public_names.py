@@ -10,7 +10,8 @@ import gelflow.session as session
 
 
 def test_packages_are_attributes_of_gelflow() -> None:
-    assert set(gelflow.__all__) == {"hardware_mocks", "perception", "policies", "real", "session", "sim"}
+    folders = {"gel", "hardware_mocks", "perception", "policies", "real", "session", "sim", "view"}
+    assert set(gelflow.__all__) == folders
     assert set(gelflow.__all__) <= set(dir(gelflow))
     assert gelflow.session.SessionReader is session.SessionReader
 
