@@ -21,7 +21,7 @@ Image = NDArray[np.uint8]
 _JPEG = b"\xff\xd8\xff"
 _PORTS = {"http": 80, "https": 443, "rtsp": 554, "rtmp": 1935}  # default ports of the protocols over TCP
 _MISSING, _MISSING_SHARE = 2, 0.02  # images at the end of a video that its container may announce in excess
-_LARGEST_INT = 2**31 - 1  # of OpenCV, a number that no camera has
+_LARGEST_INT = 2**31 - 1  # that OpenCV takes as the number of a camera
 _BACKLOG = 8  # live images that wait for the program
 # Silences FFmpeg; OpenCV reads the variable at the first use of FFmpeg.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")

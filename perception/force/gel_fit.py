@@ -66,8 +66,12 @@ class GelFit:
     contacts: int
     largest_ratio: float  # of shear to normal force: a lower limit of the friction
     thickness: float | None  # with which both factors would agree [m]; None where they do
-    doubtful: bool  # whether the normal forces of the contacts scatter as with a wrong thickness
     creep_deviation: float | None  # None without a fitted lag
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether the normal forces of the contacts scatter as with a wrong thickness."""
+        return _scatter(self.normal) > _DOUBTFUL_SCATTER
 
 
 def read_samples(estimates: Path, measured: Path) -> ForceSamples:
@@ -148,9 +152,8 @@ def fit_gel(samples: ForceSamples, gel: ElasticGel) -> GelFit:
         thickness = gel.thickness * shear.value / normal.value
         # Both factors depend on the thickness, so their mean may be wrong by as much as they differ.
         deviation = max(deviation, abs(normal.value / shear.value - 1))
-    doubtful = normal is not None and (normal.scatter or 0.0) > _DOUBTFUL_SCATTER
-    if normal and normal.scatter and doubtful:
-        deviation = max(deviation, _DOUBT * normal.scatter)
+    if _scatter(normal) > _DOUBTFUL_SCATTER:
+        deviation = max(deviation, _DOUBT * _scatter(normal))
     pressed = samples.normal > 0.2 * samples.normal.max()
     return GelFit(
         gel=replace(
@@ -165,7 +168,6 @@ def fit_gel(samples: ForceSamples, gel: ElasticGel) -> GelFit:
         contacts=len(np.unique(samples.contact)),
         largest_ratio=float((samples.shear[pressed] / samples.normal[pressed]).max()),
         thickness=thickness,
-        doubtful=doubtful,
         creep_deviation=creep_deviation,
     )
 
@@ -189,6 +191,11 @@ def _factor(samples: ForceSamples, estimated: Array, measured: Array, kind: str)
         variance = squares @ (products / squares / value - 1) ** 2 / squares.sum()
         scatter = math.sqrt(float(variance) * count / (count - 1))
     return Factor(value, math.hypot(spread, _CONTACT_ERROR[kind] * value / math.sqrt(count)), scatter)
+
+
+def _scatter(factor: Factor | None) -> float:
+    """0 where it is not known."""
+    return 0.0 if factor is None or factor.scatter is None else factor.scatter
 
 
 def _lag(samples: ForceSamples) -> tuple[float, float, float | None]:

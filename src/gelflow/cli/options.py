@@ -4,7 +4,7 @@ import argparse
 import contextlib
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from gelflow.errors import UsageError
@@ -53,11 +53,12 @@ def removed_on_error(*files: Path) -> Iterator[None]:
         raise
 
 
-def has_content(file: Path) -> bool:
-    """Whether a new file was written; an empty one, as of a full disk, is deleted."""
-    if file.is_file() and not file.stat().st_size:
-        file.unlink()
-    return file.is_file()
+def delete_empty(files: Sequence[Path]) -> list[Path]:
+    """Delete new files without contents, as a full disk leaves them; the files that remain."""
+    for file in files:
+        if file.is_file() and not file.stat().st_size:
+            file.unlink()
+    return [file for file in files if file.is_file()]
 
 
 def picture_beside(file: Path) -> Path:

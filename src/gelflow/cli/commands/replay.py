@@ -57,18 +57,16 @@ def run(args: argparse.Namespace) -> int:
         comparisons = replay_with_progress(session, task, perception, policy, damage=damage)
         latencies = _latencies(session, description)
     result = _Result(comparisons, total - len(comparisons), damage, notes, latencies)
-    picture, failure = args.out if comparisons else None, None
+    picture = args.out if comparisons else None
     if picture:
         from gelflow.session.decision_picture import draw_comparisons
 
         try:
             draw_comparisons(comparisons, task.grid, picture)
-        except UsageError as error:  # the comparison is shown nevertheless
-            picture, failure = None, error
-    status = _show(output, result, picture)
-    if failure is not None:
-        raise failure
-    return status
+        except UsageError:
+            _show(output, result, None)
+            raise
+    return _show(output, result, picture)
 
 
 def _replay_in_simulation(args: argparse.Namespace) -> int:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rich.table import Table
 
 from gelflow.cli.exit_codes import SUCCESS
-from gelflow.cli.options import add_json, add_page_address, add_profile, check_at_least, check_new_file, has_content
+from gelflow.cli.options import add_json, add_page_address, add_profile, check_at_least, check_new_file, delete_empty
 from gelflow.cli.output import Output, progress_bar
 from gelflow.errors import UsageError
 from gelflow.gel.gel_file import ElasticGel, load_gel
@@ -118,7 +118,7 @@ def run(args: argparse.Namespace) -> int:
         summary.complete = True
     finally:
         # An error or Ctrl-C keeps the results of the images before it.
-        files = [file for file in args.out if has_content(file)]
+        files = delete_empty(args.out)
         if summary.images:
             seconds, name = time.perf_counter() - begin, None if gel is None else gel.text
             _show(output, summary, source.skipped, seconds, files, name)
