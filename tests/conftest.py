@@ -20,6 +20,14 @@ settings.register_profile("gelflow", deadline=None, derandomize=True)
 settings.load_profile("gelflow")
 
 
+@pytest.fixture(autouse=True)
+def _normal_priority() -> Iterator[None]:
+    """A test that raises the priority of its own thread would starve all later tests beside it."""
+    yield
+    if hasattr(os, "sched_getscheduler"):
+        assert os.sched_getscheduler(0) == os.SCHED_OTHER
+
+
 @pytest.fixture(scope="session", autouse=True)
 def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Distance grids are cached in a folder of this run instead of the user's cache."""

@@ -46,12 +46,15 @@ class EgmLoop:
         self._robot: tuple[str, int] | None = None
         self._sent = 0
 
-    def run(self) -> None:
-        """Run until the parent ends. An exception ends the process, and nothing is sent to the robot any more."""
+    def run(self, *, priority: str = "normal") -> None:
+        """Run until the parent ends. An exception ends the process, and nothing is sent to the robot any more.
+
+        `priority` of this thread is reported.
+        """
         parent = os.getppid()
         sources: list[socket.socket | Messages] = [self._udp, self._parent]
         self._flush()
-        self._event("listening", f"{'real-time' if raise_priority() else 'normal'} priority")
+        self._event("listening", f"{priority} priority")
         start = self._clock.now()
         while not self._parent.closed and os.getppid() == parent:
             # All messages that the robot sent before `start` are in the log: a pose in it is never older than the lead,
@@ -183,7 +186,7 @@ def main(arguments: list[str]) -> int:
     # No reference cycles are created here; a garbage collection would only delay an answer.
     gc.disable()
     with suppress(ConnectionError):
-        EgmLoop(config, clock, udp, parent, log).run()
+        EgmLoop(config, clock, udp, parent, log).run(priority="real-time" if raise_priority() else "normal")
     clock.grant(ARM_DRIVER, math.inf)
     return 0
 

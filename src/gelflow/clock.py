@@ -114,10 +114,12 @@ class ScaledClock:
 def raise_priority() -> bool:
     """Give the calling thread real-time priority where the system allows it; return whether it did.
 
-    For threads that must answer within a millisecond or two and sleep most of the time; nothing depends on it.
+    For threads that must answer within a millisecond or two and sleep most of the time; nothing depends on it. Threads
+    and processes that the calling thread starts have normal priority again.
     """
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(20))  # priorities range from 1 to 99
+        # Priorities range from 1 to 99.
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(20))
     except (AttributeError, OSError):  # not available on macOS, or not permitted
         return False
     return True

@@ -2,13 +2,14 @@
 
 import itertools
 import math
+import os
 import threading
 import time
 from pathlib import Path
 
 import pytest
 
-from gelflow.clock import ScaledClock
+from gelflow.clock import ScaledClock, raise_priority
 from gelflow.errors import UsageError
 from gelflow.time_sync import CONTROLLER, MAX_LEAD, RUNNER, SIMULATED_CELL, TimeSync
 
@@ -132,3 +133,23 @@ def test_robot_time_is_monotonic_under_concurrent_grants(synchronized: tuple[Sca
 def test_a_missing_time_sync_file_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="there is no mock robot behind"):
         ScaledClock(1.0, str(tmp_path / "gone"))
+
+
+@pytest.mark.skipif(not hasattr(os, "SCHED_FIFO"), reason="this system has no real-time priority")
+def test_raised_priority_is_that_of_the_calling_thread_alone() -> None:
+    policies: list[int] = []
+
+    def started() -> None:
+        policies.append(os.sched_getscheduler(0))
+
+    def raising() -> None:
+        raised = raise_priority()
+        policies.append(os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK if raised else os.SCHED_FIFO)
+        thread = threading.Thread(target=started)
+        thread.start()
+        thread.join()
+
+    thread = threading.Thread(target=raising)
+    thread.start()
+    thread.join()
+    assert policies == [os.SCHED_FIFO, os.SCHED_OTHER] and os.sched_getscheduler(0) == os.SCHED_OTHER
