@@ -190,7 +190,7 @@ class MockMjpegCamera:
                 self._changed.notify_all()
             due = max(due + self._period, self._clock.now() - self._period)
             self._allow(due + MAX_LEAD)
-            self._clock.sleep(due - self._clock.now())
+            self._clock.sleep_until(due)
 
     @property
     def _silent(self) -> bool:

@@ -314,7 +314,7 @@ class _Loop:
             if left <= 0:
                 return
             if self._asked is None:
-                self._clock.sleep(left)
+                self._clock.sleep_until(due)
             elif select.select((self._parent,), (), (), max(self._clock.wall(left), MIN_WAIT))[0]:
                 self._handle_parent()
 

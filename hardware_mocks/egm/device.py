@@ -64,12 +64,15 @@ class MockEgmArm:
             raise
 
     def stop(self) -> None:
-        """Stop sending, as a controller that is switched off."""
+        """Stop sending, as a controller that is switched off. Raises PeerError when its process has ended before."""
         if self._helper is not None and self._thread is not None:
             self._quit.set()
             self._thread.join()
-            self._helper.close()
-            self._helper = self._thread = None
+            helper, self._helper, self._thread = self._helper, None, None
+            ended = helper.exit_reason() if helper.messages.closed else ""
+            helper.close()
+            if ended:
+                raise PeerError(f"the mock controller's process has ended ({ended})")
 
     @property
     def report(self) -> MockEgmReport:

@@ -60,8 +60,15 @@ class ScaledClock:
             if seconds > 0:
                 time.sleep(seconds / self.factor)
             return
-        end = self.now() + seconds
-        while (left := end - self.now()) > 0:
+        self.sleep_until(self.now() + seconds)
+
+    def sleep_until(self, instant: float) -> None:
+        """Wait until the robot time `instant` [s].
+
+        A slot that limits robot time waits so, not for a duration: if it is interrupted after the reading of the clock
+        that gave the duration, the wait ends after its own limit, which robot time does not reach.
+        """
+        while (left := instant - self.now()) > 0:
             time.sleep(max(left / self.factor, MIN_WAIT))
 
     def wall(self, seconds: float) -> float:

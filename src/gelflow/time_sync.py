@@ -19,7 +19,7 @@ SIMULATED_CELL, CONTROLLER, LEFT_CAMERA, RIGHT_CAMERA, GRIPPER, ARM_DRIVER, RUNN
 MAX_LEAD = 0.02  # lead of robot time over the last finished step, at most [s]
 MIN_WAIT = 2e-4  # shortest sleep while robot time stands still [s, wall]
 _WORDS = 1 + 2 * _SLOTS  # delay [s], then for each slot: wall time of its last grant [s], its limit [s, robot time]
-_SLOT_TIMEOUT = 5.0  # a slot that grants nothing for longer is taken for dead and ignored [s, wall]
+_SLOT_TIMEOUT = 15.0  # a slot that grants nothing for longer is taken for dead and ignored [s, wall]
 
 
 class TimeSync:

@@ -5,13 +5,16 @@ import math
 import os
 import threading
 import time
+import urllib.request
 from pathlib import Path
 
 import pytest
 
+from gelflow import time_sync
 from gelflow.clock import ScaledClock, raise_priority
 from gelflow.errors import UsageError
-from gelflow.time_sync import CONTROLLER, MAX_LEAD, RUNNER, SIMULATED_CELL, TimeSync
+from gelflow.hardware_mocks.camera.device import MockMjpegCamera
+from gelflow.time_sync import CONTROLLER, LEFT_CAMERA, MAX_LEAD, RUNNER, SIMULATED_CELL, TimeSync
 
 
 @pytest.fixture
@@ -83,6 +86,34 @@ def test_sleep_waits_for_robot_time(synchronized: tuple[ScaledClock, ScaledClock
     assert not sleeper.is_alive() and clock.now() >= start + 1.0
 
 
+class InterruptedClock(ScaledClock):
+    """The process is interrupted after each reading of the clock."""
+
+    def now(self) -> float:
+        now = super().now()
+        time.sleep(0.005)
+        return now
+
+
+def test_an_interrupted_camera_does_not_stop_robot_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It waited for an instant after its own limit, until it was taken for dead."""
+    monkeypatch.setattr(time_sync, "_SLOT_TIMEOUT", math.inf)
+    TimeSync.create(path := str(tmp_path / "time_sync"))
+    number = itertools.count()
+    made = threading.Event()
+
+    def image() -> bytes:
+        if next(number) == 5:
+            made.set()
+        return b"image"
+
+    with (
+        MockMjpegCamera(image, InterruptedClock(10.0, path), rate=3.0, slot=LEFT_CAMERA) as camera,
+        urllib.request.urlopen(camera.url, timeout=20.0),
+    ):
+        assert made.wait(20.0)
+
+
 def test_robot_time_waits_for_a_bounded_block(synchronized: tuple[ScaledClock, ScaledClock]) -> None:
     clock, other = synchronized
     with clock.bounded(RUNNER) as renew:
@@ -107,7 +138,7 @@ def test_a_slot_without_grants_is_ignored_after_its_timeout(
     limit = clock.now()
     clock.grant(SIMULATED_CELL, limit)
     real = time.monotonic
-    monkeypatch.setattr(time, "monotonic", lambda: real() + 6.0)
+    monkeypatch.setattr(time, "monotonic", lambda: real() + 16.0)
     assert clock.now() == pytest.approx(limit + 100.0, abs=20.0)
 
 

@@ -261,6 +261,9 @@ def test_killed_controller_is_detected(bench: Bench) -> None:
         for _ in range(1000):
             bench.mock.motors(True)
             time.sleep(0.01)
+    with pytest.raises(PeerError, match=r"has ended \(exit status -9\)"):
+        bench.mock.stop()
+    bench.mock.stop()
 
 
 @pytest.mark.parametrize("changes", [{"lag": 0.0}, {"port": 0}, {"comm_timeout": -1.0}])
