@@ -69,6 +69,7 @@ class MockEgmArm:
             self._quit.set()
             self._thread.join()
             helper, self._helper, self._thread = self._helper, None, None
+            helper.messages.read()  # notices that the process has ended
             ended = helper.exit_reason() if helper.messages.closed else ""
             helper.close()
             if ended:
