@@ -286,9 +286,8 @@ class _Loop:
         while not self._parent.closed and os.getppid() == grandparent:
             self._wait_until(due)
             self._listen()
-            # The controller's time continues while this computer is busy: missed cycles are skipped. Robot time may
-            # step back when another process is interrupted between reading and limiting it.
-            missed = max(0, int((self._clock.now() - due) / self._config.period))
+            # The controller's time continues while this computer is busy: missed cycles are skipped.
+            missed = int((self._clock.now() - due) / self._config.period)
             due += (1 + missed) * self._config.period
             data, move = self._controller.cycle(1 + missed)
             self._send(data)

@@ -70,10 +70,10 @@ class MockEgmArm:
             self._thread.join()
             helper, self._helper, self._thread = self._helper, None, None
             helper.messages.read()  # notices that the process has ended
-            ended = helper.exit_reason() if helper.messages.closed else ""
+            error = _ended(helper) if helper.messages.closed else None
             helper.close()
-            if ended:
-                raise PeerError(f"the mock controller's process has ended ({ended})")
+            if error is not None:
+                raise error
 
     @property
     def report(self) -> MockEgmReport:
@@ -126,12 +126,12 @@ class MockEgmArm:
             try:
                 helper.messages.send(["do", number, name, *values])
             except OSError:
-                raise PeerError(f"the mock controller's process has ended ({helper.exit_reason()})") from None
+                raise _ended(helper) from None
             self._replied.wait_for(lambda: number in self._replies or helper.messages.closed, _REPLY_TIMEOUT)
             if number in self._replies:
                 return self._replies.pop(number)
         if helper.messages.closed:
-            raise PeerError(f"the mock controller's process has ended ({helper.exit_reason()})")
+            raise _ended(helper)
         raise PeerTimeout(f"the mock controller's process did not answer within {_REPLY_TIMEOUT} s")
 
     def _serve(self, helper: HelperProcess) -> None:
@@ -164,3 +164,7 @@ class MockEgmArm:
         position, quaternion = self._plant.arm_pose()
         (x, y, z), (a, b, c, d) = position.tolist(), quaternion.tolist()
         return (x, y, z), (a, b, c, d)
+
+
+def _ended(helper: HelperProcess) -> PeerError:
+    return PeerError(f"the mock controller's process has ended ({helper.exit_reason()})")

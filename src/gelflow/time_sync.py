@@ -31,6 +31,7 @@ class TimeSync:
                 self._words = memoryview(mmap.mmap(file.fileno(), 8 * _WORDS)).cast("d")
         except (OSError, ValueError):
             raise UsageError(f"there is no mock robot behind {path}: has it ended? start it again") from None
+        self._newest = -math.inf  # robot time read here so far [s]
 
     @staticmethod
     def create(path: str) -> None:
@@ -79,4 +80,6 @@ class TimeSync:
         for granted, limit in zip(words[1::2], words[2::2], strict=True):
             if now > limit:
                 now = min(now, limit + max(0.0, wall - granted - _SLOT_TIMEOUT) * factor)
+        # A process that is interrupted after it has read robot time grants a limit that is already past.
+        self._newest = now = max(now, self._newest)
         return now, wall

@@ -142,6 +142,18 @@ def test_a_slot_without_grants_is_ignored_after_its_timeout(
     assert clock.now() == pytest.approx(limit + 100.0, abs=20.0)
 
 
+def test_an_interrupted_grant_does_not_set_robot_time_back(tmp_path: Path) -> None:
+    TimeSync.create(path := str(tmp_path / "time_sync"))
+    reader, writer = TimeSync(path), TimeSync(path)
+    limit = writer.now(100.0)
+    time.sleep(0.01)  # a second of robot time, until the limit is written
+    before = reader.now(100.0)
+    writer.grant(RUNNER, limit)
+    assert before > limit and reader.now(100.0) == before
+    writer.grant(RUNNER, math.inf)
+    assert reader.now(100.0) > before
+
+
 def test_robot_time_is_monotonic_under_concurrent_grants(synchronized: tuple[ScaledClock, ScaledClock]) -> None:
     clock, other = synchronized
     ending = threading.Event()
@@ -155,7 +167,10 @@ def test_robot_time_is_monotonic_under_concurrent_grants(synchronized: tuple[Sca
 
     writer = threading.Thread(target=world)
     writer.start()
-    times = [clock.now() for _ in range(20000)]
+    reader, times = TimeSync(clock.time_sync), []
+    for _ in range(20000):
+        reader._newest = -math.inf  # as in a process that has read no earlier time
+        times.append(reader.now(clock.factor))
     ending.set()
     writer.join()
     assert all(b >= a - 1e-9 for a, b in itertools.pairwise(times))
