@@ -3,7 +3,9 @@
 The first image is the reference: it gives the grid of markers and the dot model. Images at rest that follow refine the
 reference. In each further image, all dots are detected again, which avoids drift, assigned to markers and fitted with
 the dot model. The C++ part in csrc processes each image: dot_detector.hpp detects, assignment.hpp assigns, dot_fit.hpp
-fits. Equal images in equal order give bit-identical results.
+fits. Images with large dots are downsampled for it: wide edges lead a fit to the dot from further away. Where the dots
+are not too large for the windows of the fit, intact ones are then fitted again in the image itself. Equal images in
+equal order give bit-identical results.
 """
 
 from dataclasses import dataclass
@@ -14,12 +16,15 @@ from numpy.typing import NDArray
 
 from gelflow.errors import PeerError, UsageError
 from gelflow.perception._tracker import Tracker
-from gelflow.perception.dot_model import fit_dot_model
+from gelflow.perception.dot_model import DotModel, fit_dot_model
+from gelflow.perception.errors import TrackerInitError
 from gelflow.perception.grid_detection.detect import downsample
-from gelflow.perception.grid_detection.grid import find_grid
+from gelflow.perception.grid_detection.grid import MarkerGrid, find_grid
 from gelflow.perception.grid_detection.grid_part import GridRequest, Polarity
 
-_MAX_RADIUS = 10.0  # of a dot [px]; larger images are downsampled, since more pixels add no accuracy
+_MAX_RADIUS = 10.0  # of a dot [px] in the image that is searched for dots
+_MAX_FINE_RADIUS = 12.5  # of a dot [px] in the image in which dots are fitted again
+_LARGEST_OFFSET = 0.1  # of the two centres of an intact dot [radii]
 
 
 @dataclass(frozen=True)
@@ -50,15 +55,34 @@ class TrackingResult:
 
 
 @dataclass(frozen=True)
+class _Scale:
+    """The tracker started with the first image at one resolution."""
+
+    tracker: Tracker
+    model: DotModel
+    shrink: int  # downsampling factor of the images
+
+    def rest(self) -> NDArray[np.float64]:
+        """Positions of the markers at rest in the image that is not downsampled [px], shape (markers, 2)."""
+        return _upscaled(self.tracker.rest(), self.shrink)
+
+
+@dataclass(frozen=True)
 class _Reference:
     """The tracker started with the first image."""
 
-    tracker: Tracker
+    coarse: _Scale  # which detects and assigns the dots
+    fine: _Scale | None  # which fits intact dots again; None where the coarse one suffices
+    intact: NDArray[np.bool_]  # whether `fine` fits the dot, shape (markers,)
     size: tuple[int, int]  # height and width of the images [px]
-    shrink: int  # downsampling factor of the images for the C++ part
     rows: int
     cols: int
     spacing: float  # [px]
+
+    def rest(self) -> NDArray[np.float64]:
+        """Positions of the markers at rest [px], shape (markers, 2)."""
+        rest = self.coarse.rest()
+        return rest if self.fine is None else np.where(self.intact[:, None], self.fine.rest(), rest)
 
 
 class MarkerTracker:
@@ -77,7 +101,7 @@ class MarkerTracker:
         """
         if self._reference is None:
             raise UsageError("the tracker has no rest positions yet: start it with an image at rest")
-        return _upscaled(self._reference.tracker.rest(), self._reference.shrink)
+        return self._reference.rest()
 
     def start(self, image: NDArray[np.uint8], rows: int | None = None, cols: int | None = None) -> TrackingResult:
         """Finds the grid of markers in `image` (B G R or grey) and makes it the reference, with zero displacements.
@@ -92,13 +116,13 @@ class MarkerTracker:
         rows, cols = (config.rows, config.cols) if rows is None else (rows, cols)
         request = GridRequest(rows, cols, config.either_way, config.polarity, config.skipped, config.anchor)
         grid = find_grid(image, request)
-        shrink = max(1, int(np.ceil(grid.radius / _MAX_RADIUS)))
-        tracker, model = fit_dot_model(downsample(image, shrink), grid.scaled(1 / shrink))
-        rest = _upscaled(model.rest, shrink)
+        coarse = _started(image, grid, _MAX_RADIUS)
+        fine, intact = _fine_scale(image, grid, coarse)
         rows, cols = grid.shape
-        self._reference = _Reference(tracker, (image.shape[0], image.shape[1]), shrink, rows, cols, grid.spacing)
-        still, visible = np.zeros_like(rest), model.visible
-        return TrackingResult(rest, still, visible, ~visible, model.quality, rows, cols, grid.spacing)
+        self._reference = _Reference(coarse, fine, intact, (image.shape[0], image.shape[1]), rows, cols, grid.spacing)
+        visible = coarse.model.visible
+        rest, quality = self._reference.rest(), coarse.model.quality
+        return TrackingResult(rest, np.zeros_like(rest), visible, ~visible, quality, rows, cols, grid.spacing)
 
     def track(self, image: NDArray[np.uint8]) -> TrackingResult:
         """The markers in the next image (B G R or grey). Without `start`, the first image must show
@@ -114,13 +138,55 @@ class MarkerTracker:
         if image.shape[:2] != reference.size:
             got, expected = (f"{width} × {height} px" for height, width in (image.shape[:2], reference.size))
             raise PeerError(f"the image size changed from {expected} to {got}: start the tracker again")
-        shrink = reference.shrink
-        result = reference.tracker.track(downsample(image, shrink))
+        shrink = reference.coarse.shrink
+        result = reference.coarse.tracker.track(downsample(image, shrink))
         position, displacement = result.position, result.displacement
         if shrink > 1:
             position, displacement = _upscaled(position, shrink), shrink * displacement
+        if reference.fine is not None:
+            displacement = _refined(reference, reference.fine, image, position, displacement, result.valid)
+            position = np.where(np.isfinite(displacement), reference.rest() + displacement, position)
         grid = reference.rows, reference.cols, reference.spacing
         return TrackingResult(position, displacement, result.valid, result.inferred, result.quality, *grid)
+
+
+def _started(image: NDArray[np.uint8], grid: MarkerGrid, max_radius: float) -> _Scale:
+    """The tracker started on `image`, downsampled until the radius of its dots is at most `max_radius` [px]."""
+    shrink = _shrink(grid, max_radius)
+    tracker, model = fit_dot_model(downsample(image, shrink), grid.scaled(1 / shrink))
+    return _Scale(tracker, model, shrink)
+
+
+def _shrink(grid: MarkerGrid, max_radius: float) -> int:
+    return max(1, int(np.ceil(grid.radius / max_radius)))
+
+
+def _fine_scale(image: NDArray[np.uint8], grid: MarkerGrid, coarse: _Scale) -> tuple[_Scale | None, NDArray[np.bool_]]:
+    """`fine` and `intact` of a `_Reference`."""
+    nothing = None, np.zeros(len(coarse.model.rest), dtype=np.bool_)
+    if _shrink(grid, _MAX_FINE_RADIUS) == coarse.shrink:
+        return nothing
+    try:
+        fine = _started(image, grid, _MAX_FINE_RADIUS)
+    except TrackerInitError:
+        return nothing
+    offset = fine.rest() - coarse.rest()
+    intact = fine.model.visible & (fine.model.mask_of < 0) & (coarse.model.mask_of < 0)
+    return fine, intact & (np.hypot(offset[:, 0], offset[:, 1]) < _LARGEST_OFFSET * grid.radius)
+
+
+def _refined(
+    reference: _Reference,
+    fine: _Scale,
+    image: NDArray[np.uint8],
+    position: NDArray[np.float64],
+    displacement: NDArray[np.float64],
+    valid: NDArray[np.bool_],
+) -> NDArray[np.float64]:
+    """Displacements [px] from `fine` where its fit ends near `position`, and `displacement` elsewhere."""
+    begin = (position + 0.5) / fine.shrink - 0.5
+    found = fine.tracker.refine(downsample(image, fine.shrink), begin, valid & reference.intact)
+    return np.where(found.valid[:, None], fine.shrink * found.displacement, displacement)
 
 
 def _as_bgr(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

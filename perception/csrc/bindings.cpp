@@ -140,8 +140,9 @@ py::array_t<double> rest(SharedTracker& shared) {
   return out;
 }
 
-TrackResult track(SharedTracker& shared, const Image& image) {
-  const std::uint8_t* pixels = shared.pixels(image);
+// Runs `step`, which is the next image's, and returns its markers.
+template <class Step>
+TrackResult next_image(SharedTracker& shared, Step step) {
   const py::ssize_t n = shared.tracker.markers();
   TrackResult out{py::array_t<double>({n, py::ssize_t(2)}), py::array_t<double>({n, py::ssize_t(2)}),
                   py::array_t<bool>(n), py::array_t<bool>(n), py::array_t<double>(n)};
@@ -152,7 +153,7 @@ TrackResult track(SharedTracker& shared, const Image& image) {
     py::gil_scoped_release release;
     const std::lock_guard lock(shared.mutex);
     Tracker& tracker = shared.tracker;
-    tracker.track(pixels);
+    step(tracker);
     const bool any = tracker.anything_valid();
     const double nan = std::numeric_limits<double>::quiet_NaN();
     for (py::ssize_t m = 0; m < n; ++m) {
@@ -165,6 +166,26 @@ TrackResult track(SharedTracker& shared, const Image& image) {
     }
   }
   return out;
+}
+
+TrackResult track(SharedTracker& shared, const Image& image) {
+  const std::uint8_t* pixels = shared.pixels(image);
+  return next_image(shared, [pixels](Tracker& tracker) { tracker.track(pixels); });
+}
+
+TrackResult refine(SharedTracker& shared, const Image& image, const Array<double>& position,
+                   const Array<bool>& wanted) {
+  const std::uint8_t* pixels = shared.pixels(image);
+  const py::ssize_t n = shared.tracker.markers();
+  check_shape(position, n, 2, "position"), check_shape(wanted, n, 0, "wanted");
+  std::vector<Point> begin;
+  std::vector<char> chosen;
+  for (py::ssize_t m = 0; m < n; ++m) {
+    begin.push_back({position.at(m, 0), position.at(m, 1)}), chosen.push_back(char(wanted.at(m)));
+    if (!(std::abs(begin.back().x) < 1e6 && std::abs(begin.back().y) < 1e6))
+      throw std::invalid_argument("a position of a marker is out of range");
+  }
+  return next_image(shared, [&](Tracker& tracker) { tracker.refine(pixels, begin, chosen); });
 }
 
 }  // namespace
@@ -200,5 +221,6 @@ PYBIND11_MODULE(_tracker, module) {
            py::arg("tolerated"), py::arg("mask_of"), py::arg("masks"))
       .def("start", &start, py::arg("image").noconvert())
       .def("rest", &rest)
-      .def("track", &track, py::arg("image").noconvert());
+      .def("track", &track, py::arg("image").noconvert())
+      .def("refine", &refine, py::arg("image").noconvert(), py::arg("position"), py::arg("wanted"));
 }

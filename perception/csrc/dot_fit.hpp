@@ -235,6 +235,12 @@ struct FitSettings {
   double noise;   // standard deviation of a pixel at rest / background
 };
 
+struct FitStart {
+  Point position;
+  int max_iterations;
+  bool is_close = false;  // to the solution: no iterations with every second line
+};
+
 // Mean of the pixels along the border of the window that are inside the image; 0 without any.
 inline double border_mean(const Window& window, int width, int height) {
   double sum = 0;
@@ -249,13 +255,13 @@ inline double border_mean(const Window& window, int width, int height) {
   return count ? sum / count : 0;
 }
 
-// Fits one dot, starting at `position`. `rest_contrast` is the contrast for which H⁻¹ was computed, `tolerated` the
+// Fits one dot. `rest_contrast` is the contrast for which H⁻¹ was computed, `tolerated` the
 // scale of the robust weight k relative to background times contrast. Without a `mask`, the shape describes the whole
 // dot. The quality is 0 when the fit leaves the central
 // part of the window or the contrast changes sign.
 inline DotFit fit_dot(const Plane& plane, const FitSettings& settings, const DotShape& shape, const DotMask* mask,
-                      const InverseHessian& inverse, double rest_contrast, double tolerated, Point position,
-                      int max_iterations) {
+                      const InverseHessian& inverse, double rest_contrast, double tolerated, const FitStart& start) {
+  const Point position = start.position;
   const int size = settings.window;
   const double middle = 0.5 * (size - 1), limit = 0.8 * settings.radius + 1;
   Window window;
@@ -268,8 +274,8 @@ inline DotFit fit_dot(const Plane& plane, const FitSettings& settings, const Dot
   const double background = std::max(4.0, border_mean(window, plane.width, plane.height));
   FitState state{};
   state.x = float(begin.x), state.y = float(begin.y), state.a = float(rest_contrast), state.b = float(background);
-  bool coarse = true;
-  for (int number = 0; number < max_iterations; ++number) {
+  bool coarse = !start.is_close;
+  for (int number = 0; number < start.max_iterations; ++number) {
     state.k = state.b * float(std::max(tolerated * std::abs(double(state.a)), 3 * settings.noise));
     state.row_step = coarse ? 2 : 1;
     accumulate(window, plane.width, plane.height, settings.profile, shape, mask, state);

@@ -101,10 +101,15 @@ int main(int argc, char** argv) {
     ++trackers;
     for (int number = whole(1, 12); number > 0 && done < images; --number, ++done) {
       random_image(tracker.setup(), image);
-      if (number % 6 == 1)
+      if (number % 6 == 1) {
         tracker.start(image.data());
-      else
+      } else if (number % 6 == 2) {
+        std::vector<Point> positions = tracker.positions();
+        for (Point& position : positions) position = position + Point{real(-1, 1), real(-1, 1)};
+        tracker.refine(image.data(), positions, std::vector<char>(positions.size(), char(whole(0, 1))));
+      } else {
         tracker.track(image.data());
+      }
       check(tracker);
       for (double quality : tracker.quality()) measured += quality > 0;
     }

@@ -2,6 +2,8 @@
 
 #include <stdexcept>
 
+#include "curvature.hpp"
+
 namespace gelflow::perception {
 
 namespace {
@@ -17,6 +19,7 @@ constexpr double min_response_ratio = 0.3;  // minimum response of a dot / media
 constexpr double max_velocity = 0.25;       // in spacings per image; larger steps are jumps, without prediction
 constexpr double trusted_quality = 0.8;     // from this quality on, a fit is not compared with the neighbours
 constexpr double outlier_distance = 0.4;    // in spacings: limit for a fit of quality 1
+constexpr double largest_refinement = 0.1;  // of a position that another tracker found [radii]
 constexpr float frame_change = 0.05f;       // relative change of a frame that detected dots resolve
 constexpr float refit_change = 0.01f;       // relative change of a frame that a dot is fitted again for
 constexpr int relaxation_steps = 8;
@@ -73,7 +76,7 @@ void Tracker::start(const std::uint8_t* bgr) {
   for (std::size_t m = 0; m < setup_.rest.size(); ++m) {
     quality_[m] = 0;
     if (!setup_.visible[m]) continue;
-    const DotFit found = fit(m, setup_.rest[m], 12);
+    const DotFit found = fit(m, {setup_.rest[m], 12});
     quality_[m] = found.quality, contrasts_[m] = found.contrast;
     if (found.quality < min_quality || !is_inside(m, found.position)) {
       setup_.visible[m] = 0, quality_[m] = 0;
@@ -116,6 +119,26 @@ void Tracker::track(const std::uint8_t* bgr) {
   }
 }
 
+void Tracker::refine(const std::uint8_t* bgr, const std::vector<Point>& positions, const std::vector<char>& wanted) {
+  extract_plane(bgr, plane_, setup_.channel);
+  positions_ = positions;
+  std::fill(measured_.begin(), measured_.end(), char(1));  // inferred positions serve for shapes and curvature, too
+  for (std::size_t m = 0; m < positions_.size(); ++m) {
+    shape_[m] = deformed_shape(m);
+    displacement_[m] = positions_[m] - setup_.rest[m];
+  }
+  const double limit = largest_refinement * setup_.radius;
+  for (std::size_t m = 0; m < positions_.size(); ++m) relaxed_[m] = outline_offset(m);
+  for (std::size_t m = 0; m < positions_.size(); ++m) {
+    quality_[m] = 0, measured_[m] = 0;
+    if (!wanted[m] || !setup_.visible[m]) continue;
+    DotFit found = fit(m, {positions[m] + relaxed_[m], 8, true});
+    found.position = found.position - relaxed_[m];
+    if (squared(found.position - positions[m]) < limit * limit) accept(m, found, trusted_quality);
+  }
+  if (rest_images_ > 0) refine_rest();
+}
+
 // While nothing moves after the start, the rest positions become the mean over the images, which reduces the noise that
 // the reference adds to each displacement. Noise is independent between markers and motion is common to neighbours: for
 // independent noise, the squared mean of the eight neighbours is 0.12 times the squared deviation from it.
@@ -152,7 +175,7 @@ void Tracker::measure(const std::vector<int>& dot_of) {
     quality_[m] = 0;
     if (!measured_[m]) continue;
     measured_[m] = 0;
-    if (setup_.visible[m]) accept(m, fit(m, positions_[m], 8), min_quality);
+    if (setup_.visible[m]) accept(m, fit(m, {positions_[m], 8}), min_quality);
   }
   reject_outliers();
   if (std::none_of(measured_.begin(), measured_.end(), [](char k) { return k != 0; })) {
@@ -163,10 +186,11 @@ void Tracker::measure(const std::vector<int>& dot_of) {
   fill_missing();
   for (std::size_t m = 0; m < n; ++m) {
     if (measured_[m] || !setup_.visible[m]) continue;
-    const DotFit found = fit(m, positions_[m], 8);
+    const DotFit found = fit(m, {positions_[m], 8});
     if (is_unoccupied(int(m), found.position)) accept(m, found, min_quality_undetected);
   }
   reject_outliers();
+  correct_curvature();
   fill_missing();
   for (std::size_t m = 0; m < n; ++m) shape_[m] = deformed_shape(m);
 }
@@ -178,7 +202,7 @@ void Tracker::refit_deformed() {
   for (std::size_t m = 0; m < positions_.size(); ++m) {
     if (!measured_[m] || !differ(next_shape_[m], shape_[m], refit_change)) continue;
     shape_[m] = next_shape_[m];
-    accept(m, fit(m, positions_[m], 8), min_quality);
+    accept(m, fit(m, {positions_[m], 8}), min_quality);
   }
 }
 
@@ -214,6 +238,18 @@ DotShape Tracker::deformed_shape(std::size_t marker) const {
           float(f.yx * xy + f.yy * yy), f.waves};
 }
 
+// Moves the measured positions from the centres of the outlines to those of the dots.
+void Tracker::correct_curvature() {
+  for (std::size_t m = 0; m < displacement_.size(); ++m) displacement_[m] = positions_[m] - setup_.rest[m];
+  for (std::size_t m = 0; m < displacement_.size(); ++m)
+    if (measured_[m]) positions_[m] = positions_[m] - outline_offset(m);
+}
+
+Point Tracker::outline_offset(std::size_t marker) const {
+  const GelMotion motion{setup_.grid, setup_.rest, displacement_, measured_};
+  return curvature_offset(motion, marker, setup_.shape[marker], shape_[marker]);
+}
+
 // Whether two frames differ by more than `change`, relative to the second.
 bool Tracker::differ(const DotShape& one, const DotShape& two, float change) {
   const float limit = change * std::sqrt(two.xx * two.xx + two.xy * two.xy + two.yx * two.yx + two.yy * two.yy);
@@ -226,12 +262,13 @@ const DotMask* Tracker::mask(std::size_t marker) const {
   return index < 0 ? nullptr : &setup_.masks[std::size_t(index)];
 }
 
-DotFit Tracker::fit(std::size_t marker, Point position, int iterations) const {
+DotFit Tracker::fit(std::size_t marker, const FitStart& start) const {
+  const Point position = start.position;
   if (!(position.x > -setup_.radius && position.y > -setup_.radius && position.x < setup_.width + setup_.radius &&
         position.y < setup_.height + setup_.radius))
     return {position, 0, 0};
   const DotFit found = fit_dot(plane_, settings_, shape_[marker], mask(marker), inverse_hessian_[marker],
-                               setup_.contrast[marker], setup_.tolerated[marker], position, iterations);
+                               setup_.contrast[marker], setup_.tolerated[marker], start);
   if (!(found.quality > 0) || found.quality > uneven_light_quality * rest_quality_[marker]) return found;
   DotFit improved =
       edge_fit_.improve(plane_, shape_[marker], mask(marker), setup_.noise, setup_.tolerated[marker], found);

@@ -34,6 +34,9 @@ class Tracker {
   void start(const std::uint8_t* bgr);
   // Tracks the markers in the next image.
   void track(const std::uint8_t* bgr);
+  // Fits the `wanted` markers of the next image near `positions`, which another tracker found. The others, and those
+  // whose fit is poor or ends elsewhere, get the quality 0.
+  void refine(const std::uint8_t* bgr, const std::vector<Point>& positions, const std::vector<char>& wanted);
 
   const TrackerSetup& setup() const { return setup_; }
   int markers() const { return int(setup_.rest.size()); }
@@ -48,9 +51,11 @@ class Tracker {
   void refit_deformed();
   void accept(std::size_t marker, const DotFit& found, double threshold);
   DotShape deformed_shape(std::size_t marker) const;
+  void correct_curvature();
+  Point outline_offset(std::size_t marker) const;
   static bool differ(const DotShape& one, const DotShape& two, float change);
   const DotMask* mask(std::size_t marker) const;
-  DotFit fit(std::size_t marker, Point position, int iterations) const;
+  DotFit fit(std::size_t marker, const FitStart& start) const;
   double accepted_quality(std::size_t marker, const DotFit& fit) const;
   bool is_inside(std::size_t marker, Point position) const;
   bool is_unoccupied(int marker, Point position) const;

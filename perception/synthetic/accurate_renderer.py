@@ -3,7 +3,8 @@
 The image is composed in the order of the light path: illumination, shading of the contact, ink, specular highlights
 and occluders, optical blur, sensor noise, 8-bit quantization, JPEG. A dot is an ellipse with an edge as wide as a
 pixel. Lens distortion and gel deformation move its centre and, to first order, rotate and stretch it about that
-centre, so the ground truth is always the centre.
+centre, and the curvature of the gel's displacement curves it. The ground truth is where the centre of the undeformed
+dot has moved, which is not the centre of a curved outline.
 """
 
 from dataclasses import dataclass
@@ -106,11 +107,13 @@ class AccurateGelRenderer:
             raise UsageError(f"displacement must have shape {self._undistorted.shape} [mm], got {displacement.shape}")
         if not np.isfinite(displacement).all():
             raise UsageError("displacement of the markers must be finite")
-        centers, shapes = self._deformed_dots(appearance.to_pixels(appearance.positions_mm() + displacement))
+        centers, shapes, curvatures = self._deformed_dots(
+            appearance.to_pixels(appearance.positions_mm() + displacement)
+        )
         motion = np.zeros_like(centers) if motion_blur is None else np.asarray(motion_blur, dtype=float)
         if motion.shape != centers.shape:
             raise UsageError(f"motion_blur must have shape {centers.shape} [px], got {motion.shape}")
-        clear, dots = self._print.draw(centers, shapes, motion)
+        clear, dots = self._print.draw(centers, shapes, curvatures, motion)
         picture, hidden = self._compose(clear, contact, progress)
         visible = self._print.printed & dots.inside() & (dots.covered(hidden) < _MAX_COVERED)
         return NoiselessImage(image_layers.blurred(picture, appearance), centers, visible)
@@ -135,21 +138,36 @@ class AccurateGelRenderer:
             hidden = np.maximum(hidden, covered)
         return picture, hidden
 
-    def _deformed_dots(self, undistorted: Points) -> tuple[Points, Points]:
-        """Dot centres in the image [px], shape (markers, 2), and the deformation of each dot, shape (markers, 2, 2).
+    def _deformed_dots(self, undistorted: Points) -> tuple[Points, Points, Points]:
+        """Centres, deformation and curvature of each dot.
 
-        The deformation gradient of the gel comes from finite differences between neighbouring markers, the Jacobian
-        of the lens from finite differences of its mapping.
+        Centres in the image [px], shape (markers, 2), and `shapes` and `curvatures` of `DotPatches`. The derivatives
+        of the displacement come from finite differences between neighbouring markers, the Jacobian of the lens from
+        finite differences of its mapping.
         """
         appearance = self.appearance
         shape = (appearance.grid.rows, appearance.grid.cols, 2)
         now, rest = undistorted.reshape(shape), self._undistorted.reshape(shape)
         stretched, straight = (np.stack(np.gradient(at, axis=(0, 1)), axis=-1) for at in (now, rest))
-        gel = (stretched @ np.linalg.inv(straight)).reshape(-1, 2, 2)
+        steps = np.linalg.inv(straight)  # rows and columns per pixel
+        gel = (stretched @ steps).reshape(-1, 2, 2)
         warp = appearance.warp
         lens = np.stack([warp(undistorted + step) - warp(undistorted - step) for step in 0.5 * np.eye(2)], axis=-1)
         oval = np.diag([np.sqrt(appearance.oval), 1 / np.sqrt(appearance.oval)])
-        return warp(undistorted + self._print.offset), lens @ gel @ oval
+        shapes = lens @ gel @ oval
+        curved = np.einsum("rcmij,rcia,rcjb->rcmab", _second_differences(now - rest), steps, steps)
+        curved = oval @ curved.reshape(-1, 2, 2, 2) @ oval
+        curvatures = appearance.radius / 2 * np.einsum("dnm,dmab->dnab", np.linalg.inv(shapes) @ lens, curved)
+        return warp(undistorted + self._print.offset), shapes, curvatures
+
+
+def _second_differences(displacement: Points) -> NDArray[np.float64]:
+    """Second differences by row and column, shape (rows, cols, 2, 2, 2), 0 where a neighbour is missing."""
+    second = np.zeros((*displacement.shape, 2, 2))
+    second[1:-1, :, :, 0, 0] = np.diff(displacement, 2, axis=0)
+    second[:, 1:-1, :, 1, 1] = np.diff(displacement, 2, axis=1)
+    second[..., 0, 1] = second[..., 1, 0] = np.gradient(np.gradient(displacement, axis=0), axis=1)
+    return second
 
 
 def _encode_jpeg(image: Image, quality: int) -> bytes:

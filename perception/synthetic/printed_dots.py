@@ -100,6 +100,9 @@ class DotPatches:
     shapes: Array  # maps a disc with the appearance's radius to the dot's ellipse, shape (dots, 2, 2)
     motion_blur: Array  # motion of each dot during the exposure [px], shape (dots, 2)
     outlines: Outlines | None = None  # None: ellipses
+    # Half the second derivative of the displacement of the gel, in the frame of each dot, in which its radius is 1;
+    # shape (dots, 2, 2, 2). None: all 0.
+    curvatures: Array | None = None
 
     @cached_property
     def _half(self) -> Array:
@@ -132,7 +135,12 @@ class DotPatches:
         right = (off[:, :1] + steps).astype(np.float32)[:, None, :]
         down = (off[:, 1:] + steps).astype(np.float32)[:, :, None]
         (a, b), (c, d) = self._to_dot_frame.astype(np.float32).transpose(1, 2, 0)[..., None, None]
-        return a * right + b * down, c * right + d * down
+        x, y = a * right + b * down, c * right + d * down
+        if self.curvatures is None or not self.curvatures.any():
+            return x, y
+        (xx, xy), (_, yy) = self.curvatures.astype(np.float32).transpose(2, 3, 1, 0)[..., None, None]
+        moved = xx * (x * x) + 2 * xy * (x * y) + yy * (y * y)
+        return x - moved[0], y - moved[1]
 
     @cached_property
     def ink(self) -> Patches:
@@ -195,10 +203,11 @@ class DotPrint:
         # Of the dots from the grid, in the undistorted image (right, down) [px], shape (markers, 2).
         self.offset = appearance.print_offset * appearance.spacing * offset
 
-    def draw(self, centers: Array, shapes: Array, motion_blur: Array) -> tuple[Layer, DotPatches]:
+    def draw(self, centers: Array, shapes: Array, curvatures: Array, motion_blur: Array) -> tuple[Layer, DotPatches]:
         """Transmission (0 to 1) of the print, shape (height, width), and the patches of the markers."""
         appearance, cols = self.appearance, self.appearance.grid.cols
-        dots = DotPatches(appearance, centers, self._radii * shapes, motion_blur, self._outlines)
+        curvatures = self._radii[..., None] * curvatures
+        dots = DotPatches(appearance, centers, self._radii * shapes, motion_blur, self._outlines, curvatures)
         ink = dots.ink * np.where(self.printed, self._density, 0.0)[:, None, None]
         x, y = dots.inner
         for marker, damage in self._damages.items():

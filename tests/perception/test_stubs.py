@@ -79,9 +79,10 @@ def test_the_results_have_the_declared_types() -> None:
     tracker = MarkerTracker()
     tracker.start(image)
     assert tracker._reference is not None
-    native = tracker._reference.tracker
+    native = tracker._reference.coarse.tracker
     dtypes = {"np.float64": np.float64, "np.bool_": np.bool_}
-    for result in (native.start(image), native.track(image)):
+    refined = native.refine(image, native.rest(), np.ones(35, dtype=bool))
+    for result in (native.start(image), native.track(image), refined):
         for member, function in stub_classes(_tracker)[type(result).__name__].items():
             assert function.returns is not None
             declared = re.fullmatch(r"NDArray\[(.+)\]", ast.unparse(function.returns))

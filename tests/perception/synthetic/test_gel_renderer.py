@@ -5,6 +5,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from scipy.ndimage import map_coordinates
 
 from gelflow.errors import UsageError
 from gelflow.perception.synthetic.accurate_renderer import AccurateGelRenderer
@@ -43,10 +44,40 @@ def centroids(picture: np.ndarray, centers: np.ndarray, reach: int) -> np.ndarra
 )
 def test_the_ground_truth_is_the_centroid_of_the_ink(changed: dict[str, Any]) -> None:
     appearance = make_appearance("typical", markers=63, seed=1, **{**EVEN, **changed})
-    exposed = AccurateGelRenderer(appearance).render_noiseless(GelSequence(appearance, "twist").displacement(20))
+    rest = appearance.positions_mm()
+    strain = np.array([[0.08, 0.05], [-0.07, -0.03]])
+    exposed = AccurateGelRenderer(appearance).render_noiseless((rest - rest.mean(axis=0)) @ strain)
     assert exposed.visible.all()
     off = centroids(exposed.picture, exposed.position, reach=12) - exposed.position
     assert np.abs(off).max() < 0.003
+
+
+@pytest.mark.parametrize("oval", [1.0, 1.6])
+def test_dots_deform_like_the_image_of_the_gel(oval: float) -> None:
+    appearance = make_appearance("clean", markers=63, width=640, height=480, **{**EVEN, "oval": oval})
+    renderer, rest = AccurateGelRenderer(appearance), appearance.positions_mm()
+    middle = np.array([(appearance.width - 1) / 2, (appearance.height - 1) / 2])
+
+    def moved(at: np.ndarray) -> np.ndarray:
+        """Displacement [px] of a position relative to the middle of the image [px], both of shape (n, 2)."""
+        right, down = at.T
+        return np.stack([4e-4 * right**2 - 2e-4 * right * down, 3e-4 * down**2 + 2e-4 * right**2], axis=1)
+
+    at = appearance.to_pixels(rest)
+    mm_to_px = appearance.to_pixels(rest[0] + np.eye(2)) - at[0]
+    curved = renderer.render_noiseless(moved(at - middle) @ np.linalg.inv(mm_to_px))
+    still = renderer.render_noiseless(np.zeros_like(rest))
+    pixels = np.stack(np.meshgrid(np.arange(640), np.arange(480)), axis=-1).reshape(-1, 2) - middle
+    source = pixels.copy()
+    for _ in range(40):
+        source = pixels - moved(source)
+    right, down = (source + middle).T
+    green = map_coordinates(still.picture[..., 1], (down, right), mode="nearest").reshape(480, 640)
+    warped = np.stack([green] * 3, axis=-1)
+    inner = np.arange(63).reshape(7, 9)[1:-1, 1:-1].ravel()  # border dots have no second differences
+    found, expected = (centroids(picture, curved.position, reach=22) for picture in (curved.picture, warped))
+    assert np.linalg.norm(expected - curved.position, axis=1)[inner].min() > 0.03
+    assert np.abs(found - expected)[inner].max() < 0.006
 
 
 def test_printed_dots_are_off_the_grid() -> None:
