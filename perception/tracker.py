@@ -3,9 +3,9 @@
 The first image is the reference: it gives the grid of markers and the dot model. Images at rest that follow refine the
 reference. In each further image, all dots are detected again, which avoids drift, assigned to markers and fitted with
 the dot model. The C++ part in csrc processes each image: dot_detector.hpp detects, assignment.hpp assigns, dot_fit.hpp
-fits. Images with large dots are downsampled for it: wide edges lead a fit to the dot from further away. Where the dots
-are not too large for the windows of the fit, intact ones are then fitted again in the image itself. Equal images in
-equal order give bit-identical results.
+fits. Images with large dots are downsampled for it, which is faster, and fits converge from further away. Intact dots
+that are not too large for the window of a fit are then fitted again in the image itself. Equal images in equal order
+give bit-identical results.
 """
 
 from dataclasses import dataclass

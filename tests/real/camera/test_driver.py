@@ -324,7 +324,7 @@ def test_mock_camera_stamps_each_image_with_its_own_clock() -> None:
     heads = [head.split(b"\r\n\r\n")[0] for head in data.split(b"--boundarydonotcross\r\n")[1:6]]
     stamps = [float(head.split(b"X-Timestamp: ")[1]) for head in heads]
     assert all(head.startswith(b"Content-Type: image/jpeg\r\nContent-Length: ") for head in heads)
-    assert all(b - a > 0.01 for a, b in pairwise(stamps))
+    assert all(b > a for a, b in pairwise(stamps))  # a late image can be close to the next one
     assert stamps[-1] - stamps[0] < 1.0 and stamps[0] > CLOCK_OFFSET
 
 
