@@ -4,6 +4,7 @@ from numpy.typing import NDArray
 PROFILE_STEPS: int
 MASK_CELLS: int
 MASK_REACH: float
+LARGEST_REFINEMENT: float
 
 class StartResult:
     @property

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import PeerError, UsageError
-from gelflow.perception._tracker import Tracker
+from gelflow.perception._tracker import LARGEST_REFINEMENT, Tracker
 from gelflow.perception.dot_model import DotModel, fit_dot_model
 from gelflow.perception.errors import TrackerInitError
 from gelflow.perception.grid_detection.detect import downsample
@@ -24,7 +24,6 @@ from gelflow.perception.grid_detection.grid_part import GridRequest, Polarity
 
 _MAX_RADIUS = 10.0  # of a dot [px] in the image that is searched for dots
 _MAX_FINE_RADIUS = 12.5  # of a dot [px] in the image in which dots are fitted again
-_LARGEST_OFFSET = 0.1  # of the two centres of an intact dot [radii]
 
 
 @dataclass(frozen=True)
@@ -68,12 +67,36 @@ class _Scale:
 
 
 @dataclass(frozen=True)
+class _Refinement:
+    """Fits intact dots again, in images that are less downsampled."""
+
+    scale: _Scale
+    intact: NDArray[np.bool_]  # dots that are fitted, shape (markers,)
+
+    def rest(self, coarse: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Positions at rest [px], those of `coarse` for dots that are not intact, shape (markers, 2)."""
+        return np.where(self.intact[:, None], self.scale.rest(), coarse)
+
+    def displacement(
+        self,
+        image: NDArray[np.uint8],
+        position: NDArray[np.float64],
+        displacement: NDArray[np.float64],
+        valid: NDArray[np.bool_],
+    ) -> NDArray[np.float64]:
+        """Displacements [px] where the fit of a valid marker ends near `position`, and `displacement` elsewhere."""
+        shrink = self.scale.shrink
+        begin = (position + 0.5) / shrink - 0.5
+        found = self.scale.tracker.refine(downsample(image, shrink), begin, valid & self.intact)
+        return np.where(found.valid[:, None], shrink * found.displacement, displacement)
+
+
+@dataclass(frozen=True)
 class _Reference:
     """The tracker started with the first image."""
 
     coarse: _Scale  # which detects and assigns the dots
-    fine: _Scale | None  # which fits intact dots again; None where the coarse one suffices
-    intact: NDArray[np.bool_]  # whether `fine` fits the dot, shape (markers,)
+    fine: _Refinement | None  # None where the coarse one suffices
     size: tuple[int, int]  # height and width of the images [px]
     rows: int
     cols: int
@@ -82,7 +105,7 @@ class _Reference:
     def rest(self) -> NDArray[np.float64]:
         """Positions of the markers at rest [px], shape (markers, 2)."""
         rest = self.coarse.rest()
-        return rest if self.fine is None else np.where(self.intact[:, None], self.fine.rest(), rest)
+        return rest if self.fine is None else self.fine.rest(rest)
 
 
 class MarkerTracker:
@@ -117,9 +140,9 @@ class MarkerTracker:
         request = GridRequest(rows, cols, config.either_way, config.polarity, config.skipped, config.anchor)
         grid = find_grid(image, request)
         coarse = _started(image, grid, _MAX_RADIUS)
-        fine, intact = _fine_scale(image, grid, coarse)
+        fine = _refinement(image, grid, coarse)
         rows, cols = grid.shape
-        self._reference = _Reference(coarse, fine, intact, (image.shape[0], image.shape[1]), rows, cols, grid.spacing)
+        self._reference = _Reference(coarse, fine, (image.shape[0], image.shape[1]), rows, cols, grid.spacing)
         visible = coarse.model.visible
         rest, quality = self._reference.rest(), coarse.model.quality
         return TrackingResult(rest, np.zeros_like(rest), visible, ~visible, quality, rows, cols, grid.spacing)
@@ -144,7 +167,7 @@ class MarkerTracker:
         if shrink > 1:
             position, displacement = _upscaled(position, shrink), shrink * displacement
         if reference.fine is not None:
-            displacement = _refined(reference, reference.fine, image, position, displacement, result.valid)
+            displacement = reference.fine.displacement(image, position, displacement, result.valid)
             position = np.where(np.isfinite(displacement), reference.rest() + displacement, position)
         grid = reference.rows, reference.cols, reference.spacing
         return TrackingResult(position, displacement, result.valid, result.inferred, result.quality, *grid)
@@ -161,32 +184,17 @@ def _shrink(grid: MarkerGrid, max_radius: float) -> int:
     return max(1, int(np.ceil(grid.radius / max_radius)))
 
 
-def _fine_scale(image: NDArray[np.uint8], grid: MarkerGrid, coarse: _Scale) -> tuple[_Scale | None, NDArray[np.bool_]]:
-    """`fine` and `intact` of a `_Reference`."""
-    nothing = None, np.zeros(len(coarse.model.rest), dtype=np.bool_)
+def _refinement(image: NDArray[np.uint8], grid: MarkerGrid, coarse: _Scale) -> _Refinement | None:
+    """`fine` of a `_Reference`."""
     if _shrink(grid, _MAX_FINE_RADIUS) == coarse.shrink:
-        return nothing
+        return None
     try:
         fine = _started(image, grid, _MAX_FINE_RADIUS)
     except TrackerInitError:
-        return nothing
-    offset = fine.rest() - coarse.rest()
+        return None
+    offset = np.linalg.norm(fine.rest() - coarse.rest(), axis=1)
     intact = fine.model.visible & (fine.model.mask_of < 0) & (coarse.model.mask_of < 0)
-    return fine, intact & (np.hypot(offset[:, 0], offset[:, 1]) < _LARGEST_OFFSET * grid.radius)
-
-
-def _refined(
-    reference: _Reference,
-    fine: _Scale,
-    image: NDArray[np.uint8],
-    position: NDArray[np.float64],
-    displacement: NDArray[np.float64],
-    valid: NDArray[np.bool_],
-) -> NDArray[np.float64]:
-    """Displacements [px] from `fine` where its fit ends near `position`, and `displacement` elsewhere."""
-    begin = (position + 0.5) / fine.shrink - 0.5
-    found = fine.tracker.refine(downsample(image, fine.shrink), begin, valid & reference.intact)
-    return np.where(found.valid[:, None], fine.shrink * found.displacement, displacement)
+    return _Refinement(fine, intact & (offset < LARGEST_REFINEMENT * grid.radius))
 
 
 def _as_bgr(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

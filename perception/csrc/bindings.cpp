@@ -50,6 +50,8 @@ struct SharedTracker {
   }
 };
 
+bool is_in_range(Point position) { return std::abs(position.x) < 1e6 && std::abs(position.y) < 1e6; }
+
 void check_marker(const TrackerSetup& setup, std::size_t m) {
   const DotShape& f = setup.shape[m];
   const Point rest = setup.rest[m];
@@ -58,7 +60,7 @@ void check_marker(const TrackerSetup& setup, std::size_t m) {
       std::hypot(f.xx, f.xy, f.yx) < 4 && std::abs(f.yy) < 4 && double(f.xx) * f.yy > double(f.xy) * f.yx;
   double raggedness = 0;
   for (const float wave : f.waves) raggedness += std::abs(double(wave));
-  const bool bounded = std::abs(rest.x) < 1e6 && std::abs(rest.y) < 1e6 && contrast > 1e-3 && contrast < 1e3;
+  const bool bounded = is_in_range(rest) && contrast > 1e-3 && contrast < 1e3;
   const double tolerated = setup.tolerated[m];
   if (!regular || !bounded || !(raggedness < 0.9) || !(tolerated > 0.01 && tolerated < 10))
     throw std::invalid_argument("position, shape, contrast or tolerated residual of a marker is out of range");
@@ -182,8 +184,7 @@ TrackResult refine(SharedTracker& shared, const Image& image, const Array<double
   std::vector<char> chosen;
   for (py::ssize_t m = 0; m < n; ++m) {
     begin.push_back({position.at(m, 0), position.at(m, 1)}), chosen.push_back(char(wanted.at(m)));
-    if (!(std::abs(begin.back().x) < 1e6 && std::abs(begin.back().y) < 1e6))
-      throw std::invalid_argument("a position of a marker is out of range");
+    if (!is_in_range(begin.back())) throw std::invalid_argument("a position of a marker is out of range");
   }
   return next_image(shared, [&](Tracker& tracker) { tracker.refine(pixels, begin, chosen); });
 }
@@ -195,6 +196,7 @@ PYBIND11_MODULE(_tracker, module) {
   module.attr("PROFILE_STEPS") = DotProfile::steps;
   module.attr("MASK_CELLS") = DotMask::cells;
   module.attr("MASK_REACH") = DotMask::reach;
+  module.attr("LARGEST_REFINEMENT") = largest_refinement;
   py::class_<StartResult>(module, "StartResult")
       .def_readonly("position", &StartResult::position)
       .def_readonly("contrast", &StartResult::contrast)

@@ -48,11 +48,6 @@ class OppositeNeighbours {
 
 inline Point to_frame(const DotShape& f, Point p) { return {f.xx * p.x + f.xy * p.y, f.yx * p.x + f.yy * p.y}; }
 
-inline Point from_frame(const DotShape& f, Point p) {
-  const double area = double(f.xx) * f.yy - double(f.xy) * f.yx;
-  return 1 / area * Point{f.yy * p.x - f.xy * p.y, f.xx * p.y - f.yx * p.x};
-}
-
 // The centre of a dot's outline less that of the dot [px], from the displacements of the measured neighbours; second
 // differences that a missing neighbour leaves unknown count as zero. `rest_shape` and `shape` are those of the dot at
 // rest and on the deformed gel.
@@ -73,8 +68,9 @@ inline Point curvature_offset(const GelMotion& motion, std::size_t marker, const
   };
   const Point xx = curvature(first, first), xy = curvature(first, second), yy = curvature(second, second);
   const Point offset = 0.125 * Point{3 * xx.x + yy.x + 2 * xy.y, 3 * yy.y + xx.y + 2 * xy.x};
-  const bool is_smooth = std::hypot(offset.x, offset.y) < largest_curvature_offset;
-  return is_smooth ? from_frame(shape, offset) : Point{};
+  if (!(std::hypot(offset.x, offset.y) < largest_curvature_offset)) return {};
+  const auto [x, y] = to_image(shape, offset.x, offset.y);
+  return {x, y};
 }
 
 }  // namespace gelflow::perception

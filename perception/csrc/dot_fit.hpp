@@ -45,6 +45,13 @@ struct DotShape {
   std::array<float, 4> waves{};  // coefficients of Re z³, Im z³, Re z⁴, Im z⁴ over |z|⁴, z = d₁ + i d₂
 };
 
+// The offset (right, down) [px] of (u, v) in the frame of the dot.
+template <class Number>
+GELFLOW_INLINE std::array<Number, 2> to_image(const DotShape& shape, Number u, Number v) {
+  const float area = shape.xx * shape.yy - shape.xy * shape.yx;
+  return {(shape.yy * u - shape.xy * v) / area, (shape.xx * v - shape.yx * u) / area};
+}
+
 // Which part of a dot its shape describes: weight 1 where it does, 0 where ink is missing or another dot is joined. A
 // table over the frame of the dot; pixels beyond it take the weight of the nearest cell.
 struct DotMask {
@@ -255,10 +262,9 @@ inline double border_mean(const Window& window, int width, int height) {
   return count ? sum / count : 0;
 }
 
-// Fits one dot. `rest_contrast` is the contrast for which H⁻¹ was computed, `tolerated` the
-// scale of the robust weight k relative to background times contrast. Without a `mask`, the shape describes the whole
-// dot. The quality is 0 when the fit leaves the central
-// part of the window or the contrast changes sign.
+// Fits one dot. `rest_contrast` is the contrast for which H⁻¹ was computed, `tolerated` the scale of the robust weight k
+// relative to background times contrast. Without a `mask`, the shape describes the whole dot. The quality is 0 when the
+// fit leaves the central part of the window or the contrast changes sign.
 inline DotFit fit_dot(const Plane& plane, const FitSettings& settings, const DotShape& shape, const DotMask* mask,
                       const InverseHessian& inverse, double rest_contrast, double tolerated, const FitStart& start) {
   const Point position = start.position;

@@ -114,13 +114,6 @@ class EdgeFit {
     std::memcpy(&values[std::size_t(p)], &pack, sizeof pack);
   }
 
-  // The offset (right, down) [px] of (u, v) in the frame of the dot.
-  template <class Number>
-  GELFLOW_INLINE static std::array<Number, 2> to_image(const DotShape& shape, Number u, Number v) {
-    const float area = shape.xx * shape.yy - shape.xy * shape.yx;
-    return {(shape.yy * u - shape.xy * v) / area, (shape.xx * v - shape.yx * u) / area};
-  }
-
   // Positions of the points relative to the centre: ρ = |d| (1 − e₄) − e₃ with the waves e of the outline.
   void place_points(const DotShape& shape, const DotMask* mask, Samples& samples) const {
     const auto& w = shape.waves;

@@ -19,7 +19,6 @@ constexpr double min_response_ratio = 0.3;  // minimum response of a dot / media
 constexpr double max_velocity = 0.25;       // in spacings per image; larger steps are jumps, without prediction
 constexpr double trusted_quality = 0.8;     // from this quality on, a fit is not compared with the neighbours
 constexpr double outlier_distance = 0.4;    // in spacings: limit for a fit of quality 1
-constexpr double largest_refinement = 0.1;  // of a position that another tracker found [radii]
 constexpr float frame_change = 0.05f;       // relative change of a frame that detected dots resolve
 constexpr float refit_change = 0.01f;       // relative change of a frame that a dot is fitted again for
 constexpr int relaxation_steps = 8;

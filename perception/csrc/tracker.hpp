@@ -25,6 +25,8 @@ struct TrackerSetup {
   std::vector<DotMask> masks;
 };
 
+constexpr double largest_refinement = 0.1;  // of a position that another tracker found [radii]
+
 class Tracker {
  public:
   explicit Tracker(TrackerSetup setup);
