@@ -27,32 +27,43 @@ class DotWindows:
     """Pixel windows around the visible dots: values, offsets from the initial centre, and fitted background."""
 
     def __init__(self, plane: Floats, grid: MarkerGrid) -> None:
-        half = int(np.ceil(min(2.0 * grid.radius + 1, 0.5 * grid.spacing)))
         self.markers = np.flatnonzero(grid.visible)
         self.centre_pixel = np.round(grid.positions.reshape(-1, 2)).astype(np.intp)
+        half = min(2.0 * grid.radius + 1, 0.5 * grid.spacing)
+        self._read(plane, grid.radius, half)
+        self.contrast, self.common = self._contrast_and_shapes(grid)
+        longest = float(_half_lengths(self.common[self.markers]).max())
+        if longest > half:
+            self._read(plane, grid.radius, min(1.3 * longest, 0.5 * grid.spacing))
+        self.inner = np.flatnonzero(_length(*self.step) < max(1.6 * grid.radius, 1.2 * longest) + 1)
+
+    def _read(self, plane: Floats, radius: float, half: float) -> None:
+        """Reads windows of the side 2 `half` [px]."""
+        half = int(np.ceil(half))
         padded = cv2.copyMakeBorder(plane, half, half, half, half, cv2.BORDER_REPLICATE)
-        sampling = max(1, round(grid.radius / 3.7))  # [px], about 3 samples a radius: denser ones add no information
+        sampling = max(1, round(radius / 3.7))  # [px], about 3 samples a radius: denser ones add no information
         steps = np.arange(-half, half + 1, sampling)
         down, right = (a.reshape(-1) for a in np.meshgrid(steps, steps, indexing="ij"))
         self.step = np.stack([right, down]).astype(np.float32)  # shape (2, pixels)
         at = np.clip(self.centre_pixel[self.markers], 0, (plane.shape[1] - 1, plane.shape[0] - 1))
         self.pixels = padded[at[:, 1, None] + half + down, at[:, 0, None] + half + right].astype(np.float32)
-        self.offset = self.offsets(grid.positions.reshape(-1, 2)[self.markers], self.markers)
-        distance = _length(*self.offset)
-        self.background = fit_planes(self.pixels, self.step, (distance > 1.6 * grid.radius).astype(np.float32))
-        ratio = self.pixels / np.maximum(self.background, 1.0) - 1
-        inside = distance < 0.6 * grid.radius
-        self.contrast = np.abs((ratio * inside).sum(1) / np.maximum(inside.sum(1), 1))
-        sign = 1.0 if grid.appearance.bright else -1.0
-        self.ink = sign * ratio / np.maximum(self.contrast, 1e-3)[:, None]
-        self.common = self._common_shapes(grid, distance)
-        self.inner = np.flatnonzero(_length(*self.step) < 1.6 * grid.radius + 1)
 
-    def _common_shapes(self, grid: MarkerGrid, distance: Pixels) -> Floats:
-        """Shapes as in `DotModel` of equal elliptic dots, from the second moments of the dots and the grid steps."""
-        weight = np.clip((self.ink - 0.25) / 0.5, 0, 1) * (distance < 2.0 * grid.radius)
+    def _contrast_and_shapes(self, grid: MarkerGrid) -> tuple[Pixels, Floats]:
+        """The contrast of each dot, and shapes as in `DotModel` of equal elliptic dots.
+
+        The shapes follow from the second moments of the dots and the grid steps.
+        """
+        offset = self.offsets(grid.positions.reshape(-1, 2)[self.markers], self.markers)
+        distance = _length(*offset)
+        background = fit_planes(self.pixels, self.step, (distance > 1.6 * grid.radius).astype(np.float32))
+        ratio = self.pixels / np.maximum(background, 1.0) - 1
+        inside = distance < 0.6 * grid.radius
+        contrast = np.abs((ratio * inside).sum(1) / np.maximum(inside.sum(1), 1))
+        sign = 1.0 if grid.appearance.bright else -1.0
+        ink = sign * ratio / np.maximum(contrast, 1e-3)[:, None]
+        weight = np.clip((ink - 0.25) / 0.5, 0, 1) * (distance < 2.0 * grid.radius)
         total = np.maximum(weight.sum(1), 1e-9)
-        off = np.stack(self.offset, axis=1)
+        off = np.stack(offset, axis=1)
         off -= ((off @ weight[..., None]) / total[:, None, None]).astype(np.float32)
         moments = off * weight[:, None] @ off.transpose(0, 2, 1) / total[:, None, None]
         steps = _grid_steps(grid)
@@ -61,7 +72,7 @@ class DotWindows:
         common = np.median(inverse[self.markers] @ moments @ inverse[self.markers].transpose(0, 2, 1), axis=0)
         q = inverse.transpose(0, 2, 1) @ np.linalg.inv(4 * common) @ inverse
         frames = np.linalg.cholesky(q).transpose(0, 2, 1).reshape(-1, 4)
-        return np.concatenate([frames, np.zeros_like(frames)], axis=1)
+        return contrast, np.concatenate([frames, np.zeros_like(frames)], axis=1)
 
     def refined(self, rest: Floats, shape: Floats, profile: Pixels) -> Floats:
         """The shapes with size, stretch and waves of each dot by least squares; the median size is kept."""
@@ -162,6 +173,12 @@ class DotPixels:
         inverse = 1 / np.sqrt(square)
         stretch = (x * x - y * y) / square, 2 * x * y / square
         return np.stack([np.ones_like(x), x * inverse, y * inverse, *stretch, *self.waves], axis=1)
+
+
+def _half_lengths(shape: Floats) -> Floats:
+    """Half the largest width or height of dots [px], shape (dots,)."""
+    xx, xy, yx, yy = shape[:, :4].T
+    return np.asarray(np.maximum(np.hypot(xy, yy), np.hypot(xx, yx)) / np.abs(xx * yy - xy * yx))
 
 
 def _length(x: Pixels, y: Pixels) -> Pixels:

@@ -2,10 +2,10 @@
 
 Published tactile images come without true displacements. Warped by a known field, with sensor noise and optionally the
 shading of a contact added, they show what real prints, lenses and illuminations do to a tracker. The trackers receive
-the warped images; the truth is the field at the rest positions.
+the warped images; the truth is the field at the rest positions that are found in the first one.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.perception.benchmark.baselines import BenchmarkTracker, GelflowTracker, LucasKanade, MarkerEstimate
-from gelflow.perception.tracker import MarkerTracker
+from gelflow.perception.tracker import MarkerTracker, TrackingResult
 
 Image = NDArray[np.uint8]
 Points = NDArray[np.float64]
@@ -39,21 +39,23 @@ class WarpedErrors:
 
 def measure_warped(name: str, image: Image, *, seed: int = 0) -> WarpedErrors:
     """The errors on `image` (B G R) of a gel at rest. Raises TrackerInitError where no grid is found."""
-    first = MarkerTracker().start(image)
-    rest, spacing, shape = first.position, first.spacing, (first.rows, first.cols)
+    grid = MarkerTracker().start(image)
     errors = []
     for shading in (0.0, _SHADING):
         found: dict[str, list[float]] = {"gelflow": [], "lucas_kanade": []}
         for field in ("press", "shear", "twist"):
             trackers: dict[str, BenchmarkTracker] = {"gelflow": GelflowTracker(), "lucas_kanade": LucasKanade()}
-            for number, (warped, truth) in enumerate(_warped(image, rest, spacing, field, shading, seed)):
+            images = _warped(image, grid, field, shading, seed)
+            at_rest = next(images).image
+            first = MarkerTracker().start(at_rest, grid.rows, grid.cols)
+            for tracker in trackers.values():
+                tracker.start(at_rest, first.position, first.valid, grid.rows, grid.cols)
+            for warped in images:
+                truth = warped.displacement(first.position)
                 for key, tracker in trackers.items():
-                    if number == 0:
-                        tracker.start(warped, rest, first.valid, *shape)
-                    else:
-                        found[key] += _errors(tracker.track(warped), truth)
+                    found[key] += _errors(tracker.track(warped.image), truth)
         errors += [float(np.percentile(found[key], 95)) for key in ("gelflow", "lucas_kanade")]
-    return WarpedErrors(name, len(rest), *errors)
+    return WarpedErrors(name, len(grid.position), *errors)
 
 
 def _errors(estimate: MarkerEstimate, truth: Points) -> list[float]:
@@ -61,27 +63,35 @@ def _errors(estimate: MarkerEstimate, truth: Points) -> list[float]:
     return list(map(float, distance))
 
 
-def _warped(
-    image: Image, rest: Points, spacing: float, field: str, shading: float, seed: int
-) -> Iterator[tuple[Image, Points]]:
-    """Warped images, the first one at rest, and the displacements of the markers [px], shape (markers, 2)."""
+@dataclass(frozen=True)
+class _Warped:
+    image: Image
+    displacement: Callable[[Points], Points]  # of the gel at positions at rest (right, down) [px], shape (..., 2)
+
+
+def _warped(image: Image, grid: TrackingResult, field: str, shading: float, seed: int) -> Iterator[_Warped]:
+    """Images of a warped gel, the first one at rest; `grid`: its markers."""
     rng = np.random.default_rng(seed)
     height, width = image.shape[:2]
-    grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(float)
-    middle, reach = rest.mean(axis=0), 0.35 * float(np.ptp(rest, axis=0).min())
+    pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(float)
+    middle, reach = grid.position.mean(axis=0), 0.35 * float(np.ptp(grid.position, axis=0).min())
     for number in range(_FRAMES + 1):
-        peak = _PEAK * spacing * np.sin(np.pi * number / _FRAMES)
+        peak = _PEAK * grid.spacing * np.sin(np.pi * number / _FRAMES)
         centre = middle + 0.3 * reach * np.array([np.cos(number), np.sin(2 * number)])
-        start = grid.copy()  # of each pixel before the motion
+
+        def displacement(at: Points, peak: float = peak, centre: Points = centre) -> Points:
+            return np.asarray(peak * _field(field, (at - centre) / reach))
+
+        start = pixels  # of each pixel before the motion
         for _ in range(_INVERSE_STEPS):
-            start = grid - peak * _field(field, (start - centre) / reach)
+            start = pixels - displacement(start)
         x, y = np.moveaxis(start.astype(np.float32), -1, 0)
         moved = cv2.remap(image, x, y, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE).astype(float)
         if number and shading:
-            off = (grid - centre) / reach
+            off = (pixels - centre) / reach
             moved *= (1 + shading * (off[..., 0] + 0.5 * off[..., 1]) * np.exp(-(off**2).sum(axis=-1)))[..., None]
         noisy = moved + rng.normal(0, _NOISE, moved.shape)
-        yield noisy.clip(0, 255).round().astype(np.uint8), peak * _field(field, (rest - centre) / reach)
+        yield _Warped(noisy.clip(0, 255).round().astype(np.uint8), displacement)
 
 
 def _field(name: str, at: Points) -> Points:

@@ -14,8 +14,10 @@
 //
 //   δ = H⁻¹ Σ Jᵀ ψ(r)/b,   H = Σ JᵀJ.
 //
-// H is computed once per marker, for a dot at the centre of a pixel with its contrast at rest. This approximation
-// changes the convergence rate but not the solution of Σ Jᵀ ψ(r) = 0; an iteration then needs only six sums.
+// H is computed once per marker, for a dot at rest between four pixels. This approximation changes the convergence rate
+// but not the solution of Σ Jᵀ ψ(r) = 0; an iteration then needs only six sums. The sums include a square around the dot
+// that moves with it by parts of a pixel: if it moved by whole pixels, so would its part of a background that is not
+// linear, and the centre with it.
 #pragma once
 
 #include <array>
@@ -30,9 +32,12 @@ namespace gelflow::perception {
 typedef float FloatPack __attribute__((vector_size(32)));
 typedef std::int32_t IntPack __attribute__((vector_size(32)));
 constexpr int pack_size = 8;
+constexpr FloatPack pack_ramp = {0, 1, 2, 3, 4, 5, 6, 7};
 constexpr double coarse_tolerance = 0.1;    // step [px] down to which every second line suffices
+constexpr double recentre_distance = 0.6;   // of a dot from the centre of its window that moves the window [px]
 constexpr double contrast_tolerance = 0.1;  // step of the contrast / contrast at rest down to which a fit has converged
-constexpr double tolerance = 0.015;         // converged: the next step would be about a tenth of this one [px]
+constexpr double background_tolerance = 0.5;  // largest step of the background / scale of the robust weights
+constexpr double tolerance = 0.015;           // converged: the next step would be about a tenth of this one [px]
 
 struct DotProfile {
   static constexpr int steps = 256;
@@ -66,18 +71,26 @@ struct DotFit {
   double quality = 0;   // fraction of the edge of the dot that the profile explains, 0 to 1
 };
 
-// The pixels around a dot; the side `size` is a multiple of `pack_size`.
-struct Window {
-  static constexpr int largest = 48;
-  int left, top, size;
-  alignas(32) std::array<float, largest * largest> pixels;
-};
-
 GELFLOW_CLONES inline void copy_window(const std::uint8_t* __restrict first, int stride, int size,
                                        float* __restrict pixels) {
   for (int row = 0; row < size; ++row)
     for (int x = 0; x < size; ++x) pixels[row * size + x] = float(first[row * stride + x]);
 }
+
+// The pixels around a dot; the side `size` is a multiple of `pack_size`.
+struct Window {
+  static constexpr int largest = 64;
+  int left, top, size;
+  alignas(32) std::array<float, largest * largest> pixels;
+
+  // Reads the pixels around `position` and returns the centre of the window, at most half a pixel away.
+  Point read(const Plane& plane, Point position) {
+    const double middle = 0.5 * (size - 1);
+    left = int(std::floor(position.x - middle + 0.5)), top = int(std::floor(position.y - middle + 0.5));
+    copy_window(plane.row(0) + std::ptrdiff_t(top) * plane.stride + left, plane.stride, size, pixels.data());
+    return {left + middle, top + middle};
+  }
+};
 
 // Model parameters of one iteration, and the sums over the window.
 struct FitState {
@@ -87,7 +100,14 @@ struct FitState {
   float k;                       // scale of the robust weight [grey levels]
   double sums[6];                // Σ Jᵀψ, in the order of the unknowns
   double edge, edge_weighted;    // Σ|∇s|², unweighted and with the robust weights
-  double weight, mask;           // sums of the robust weights and of the mask
+  double weight;                 // sum of the robust weights
+
+  // The same state relative to a window centre that is moved by `offset`.
+  void recentre(Point offset) {
+    x -= float(offset.x), y -= float(offset.y);
+    const float change = std::max(0.2f, 1 + slope_x * float(offset.x) + slope_y * float(offset.y));
+    b *= change, slope_x /= change, slope_y /= change;
+  }
 };
 
 struct ProfileSample {
@@ -134,6 +154,20 @@ GELFLOW_INLINE FloatPack sample_mask(const DotMask& mask, FloatPack x, FloatPack
   return weight;
 }
 
+GELFLOW_INLINE FloatPack magnitude(FloatPack v) { return v < 0 ? -v : v; }
+
+// Part of a pixel that is within the square around a dot; `distance`: from the border of the square [px].
+GELFLOW_INLINE FloatPack taper(FloatPack distance) {
+  const FloatPack positive = distance > 0 ? distance : FloatPack{};
+  return positive < 1 ? positive : FloatPack{} + 1;
+}
+GELFLOW_INLINE FloatPack taper(float distance) { return FloatPack{} + std::clamp(distance, 0.0f, 1.0f); }
+
+// `weight` where `column` is inside the image, else 0.
+GELFLOW_INLINE FloatPack inside(FloatPack column, int width, FloatPack weight) {
+  return (column < 0) | (column > float(width - 1)) ? FloatPack{} : weight;
+}
+
 GELFLOW_INLINE double sum_lanes(FloatPack v) {
   double sum = 0;
   for (int l = 0; l < pack_size; ++l) sum += double(v[l]);
@@ -143,27 +177,22 @@ GELFLOW_INLINE double sum_lanes(FloatPack v) {
 GELFLOW_CLONES inline void accumulate(const Window& window, int width, int height, const DotProfile& profile,
                                       const DotShape& shape, const DotMask* mask, FitState& state) {
   const float middle = 0.5f * float(window.size - 1), k2 = 1 / (state.k * state.k);
-  FloatPack px{}, py{}, pa{}, pb{}, bx{}, by{}, edge{}, edge_weighted{}, weight{}, masked{};
-  const FloatPack ramp = {0, 1, 2, 3, 4, 5, 6, 7};
+  FloatPack px{}, py{}, pa{}, pb{}, bx{}, by{}, edge{}, edge_weighted{}, weight{};
   for (int row = std::max(0, -window.top); row < std::min(window.size, height - window.top); row += state.row_step) {
     const float y = float(row) - middle;
     const float* line = &window.pixels[std::size_t(row * window.size)];
+    const FloatPack near = taper(middle + 0.5f - std::abs(y - state.y));
     for (int start = 0; start < window.size; start += pack_size) {
-      const FloatPack x = ramp + (float(start) - middle);
+      const FloatPack x = pack_ramp + (float(start) - middle), dx = x - state.x;
       FloatPack pixel;
       std::memcpy(&pixel, line + start, sizeof pixel);
-      const FloatPack column = x + (middle + float(window.left));
-      const ProfileSample dot = sample_profile(profile, shape, x - state.x, y - state.y);
+      const ProfileSample dot = sample_profile(profile, shape, dx, y - state.y);
       const FloatPack ink = 1 + state.a * dot.s;
       const FloatPack r = pixel - state.b * (1 + state.slope_x * x + state.slope_y * y) * ink;
-      FloatPack w = 1 / (1 + r * r * k2);
-      const auto outside = (column < 0) | (column > float(width - 1));
-      w = outside ? FloatPack{} : w;
-      FloatPack square = dot.gx * dot.gx + dot.gy * dot.gy;
-      if (mask) {
-        const FloatPack described = sample_mask(*mask, dot.x, dot.y);
-        w *= described, square *= described, masked += described;
-      }
+      FloatPack used = near * taper(middle + 0.5f - magnitude(dx));
+      if (mask) used *= sample_mask(*mask, dot.x, dot.y);
+      const FloatPack w = inside(x + (middle + float(window.left)), width, used) / (1 + r * r * k2);
+      const FloatPack square = used * (dot.gx * dot.gx + dot.gy * dot.gy);
       const FloatPack psi = w * r, lit = psi * ink;
       px += psi * dot.gx;
       py += psi * dot.gy;
@@ -183,11 +212,14 @@ GELFLOW_CLONES inline void accumulate(const Window& window, int width, int heigh
   for (int i = 0; i < 6; ++i) state.sums[i] = share * sums[std::size_t(i)];
   state.edge = sum_lanes(edge), state.edge_weighted = sum_lanes(edge_weighted);
   state.weight = sum_lanes(weight);
-  state.mask = mask ? state.row_step * sum_lanes(masked) : double(window.size * window.size);
 }
 
-// H⁻¹ of a marker, row-major.
-using InverseHessian = std::array<double, 36>;
+// The Gauss-Newton steps of a marker.
+struct FitBasis {
+  int window;                      // side of the window [px]
+  double pixels = 0;               // that H includes
+  std::array<double, 36> inverse;  // H⁻¹, row-major
+};
 
 // Inverts a symmetric positive definite matrix by Gauss-Jordan elimination; false when it is singular.
 template <std::size_t n>
@@ -210,34 +242,37 @@ bool invert(std::array<double, n * n>& matrix, std::array<double, n * n>& invers
   return true;
 }
 
-GELFLOW_CLONES inline bool inverse_hessian(const DotProfile& profile, const DotShape& shape, const DotMask* mask,
-                                           double contrast, int size, InverseHessian& inverse) {
+// The basis for a dot at `rest` in an image of this size; its `pixels` are 0 where they do not determine the centre.
+GELFLOW_CLONES inline FitBasis fit_basis(const DotProfile& profile, const DotShape& shape, const DotMask* mask,
+                                         double contrast, int window, Point rest, int width, int height) {
   std::array<FloatPack, 36> sums{};
-  const float middle = 0.5f * float(size - 1);
-  const FloatPack ramp = {0, 1, 2, 3, 4, 5, 6, 7};
-  for (int row = 0; row < size; ++row)
-    for (int start = 0; start < size; start += pack_size) {
-      const FloatPack x = ramp + (float(start) - middle);
-      const float y = float(row) - middle, a = float(contrast);
+  FloatPack pixels{};
+  const float middle = 0.5f * float(window - 1), a = float(contrast);
+  for (int row = 0; row < window; ++row)
+    for (int start = 0; start < window; start += pack_size) {
+      const FloatPack x = pack_ramp + (float(start) - middle);
+      const float y = float(row) - middle;
+      if (y + float(rest.y) < 0 || y + float(rest.y) > float(height - 1)) continue;
       const ProfileSample dot = sample_profile(profile, shape, x, y);
+      FloatPack used =
+          inside(x + float(rest.x), width, taper(middle + 0.5f - std::abs(y)) * taper(middle + 0.5f - magnitude(x)));
+      if (mask) used *= sample_mask(*mask, dot.x, dot.y);
       const FloatPack ink = 1 + a * dot.s;
-      std::array<FloatPack, 6> j = {a * dot.gx, a * dot.gy, dot.s, ink, ink * x, ink * y};
-      if (mask) {
-        const FloatPack described = sample_mask(*mask, dot.x, dot.y);
-        for (FloatPack& term : j) term *= described;
-      }
+      const std::array<FloatPack, 6> j = {a * dot.gx, a * dot.gy, dot.s, ink, ink * x, ink * y};
       for (std::size_t i = 0; i < 6; ++i)
-        for (std::size_t l = 0; l <= i; ++l) sums[6 * i + l] += j[i] * j[l];
+        for (std::size_t l = 0; l <= i; ++l) sums[6 * i + l] += used * j[i] * j[l];
+      pixels += used;
     }
   std::array<double, 36> h;
   for (std::size_t i = 0; i < 6; ++i)
     for (std::size_t l = 0; l <= i; ++l) h[6 * i + l] = h[6 * l + i] = sum_lanes(sums[6 * i + l]);
-  return invert<6>(h, inverse);
+  FitBasis basis{window, 0, {}};
+  if (invert<6>(h, basis.inverse)) basis.pixels = sum_lanes(pixels);
+  return basis;
 }
 
 struct FitSettings {
   DotProfile profile;
-  int window;     // side of the window [px]
   double radius;  // of a dot [px]
   double noise;   // standard deviation of a pixel at rest / background
 };
@@ -248,63 +283,70 @@ struct FitStart {
   bool is_close = false;  // to the solution: no iterations with every second line
 };
 
-// Mean of the pixels along the border of the window that are inside the image; 0 without any.
-inline double border_mean(const Window& window, int width, int height) {
-  double sum = 0;
-  int count = 0;
+// The background along the border of the window, a sufficient initial value; without pixels outside the image.
+inline void start_background(const Window& window, int width, int height, bool with_slope, FitState& state) {
+  double sum = 0, count = 0, across = 0, down = 0;
   const int size = window.size;
+  const double middle = 0.5 * (size - 1);
   for (int i = 0; i < size; ++i)
     for (const auto& [x, y] : {std::pair{i, 0}, {i, size - 1}, {0, i}, {size - 1, i}}) {
       const int column = window.left + x, row = window.top + y;
       if (column < 0 || row < 0 || column >= width || row >= height) continue;
-      sum += double(window.pixels[std::size_t(size * y + x)]), ++count;
+      const double pixel = double(window.pixels[std::size_t(size * y + x)]);
+      sum += pixel, across += (x - middle) * pixel, down += (y - middle) * pixel, ++count;
     }
-  return count ? sum / count : 0;
+  state.b = float(std::max(4.0, count > 0 ? sum / count : 0));
+  if (!with_slope || count < 4 * size) return;
+  const double square = 2 * size * middle * middle * (4.0 / 3);  // sum of (x - middle)² along the border
+  state.slope_x = float(across / square) / state.b, state.slope_y = float(down / square) / state.b;
 }
 
 // Fits one dot. `rest_contrast` is the contrast for which H⁻¹ was computed, `tolerated` the scale of the robust weight k
 // relative to background times contrast. Without a `mask`, the shape describes the whole dot. The quality is 0 when the
 // fit leaves the central part of the window or the contrast changes sign.
 inline DotFit fit_dot(const Plane& plane, const FitSettings& settings, const DotShape& shape, const DotMask* mask,
-                      const InverseHessian& inverse, double rest_contrast, double tolerated, const FitStart& start) {
-  const Point position = start.position;
-  const int size = settings.window;
-  const double middle = 0.5 * (size - 1), limit = 0.8 * settings.radius + 1;
+                      const FitBasis& basis, double rest_contrast, double tolerated, const FitStart& start) {
+  const double limit = 0.8 * settings.radius + 1;
   Window window;
-  window.left = int(std::floor(position.x - middle + 0.5)), window.top = int(std::floor(position.y - middle + 0.5));
-  window.size = size;
-  const Point corner = {window.left + middle, window.top + middle}, begin = position - corner;
-  copy_window(plane.row(0) + std::ptrdiff_t(window.top) * plane.stride + window.left, plane.stride, size,
-              window.pixels.data());
-  // The mean along the border of the window, without pixels outside the image, is a sufficient initial value.
-  const double background = std::max(4.0, border_mean(window, plane.width, plane.height));
+  window.size = basis.window;
+  Point centre = window.read(plane, start.position);
   FitState state{};
-  state.x = float(begin.x), state.y = float(begin.y), state.a = float(rest_contrast), state.b = float(background);
+  state.x = float(start.position.x - centre.x), state.y = float(start.position.y - centre.y);
+  state.a = float(rest_contrast);
+  start_background(window, plane.width, plane.height, start.is_close, state);
   bool coarse = !start.is_close;
   for (int number = 0; number < start.max_iterations; ++number) {
     state.k = state.b * float(std::max(tolerated * std::abs(double(state.a)), 3 * settings.noise));
     state.row_step = coarse ? 2 : 1;
     accumulate(window, plane.width, plane.height, settings.profile, shape, mask, state);
     // H includes all pixels, the sums only those with weight.
-    const double scale = std::min(4.0, state.mask / std::max(state.weight, 1.0));
+    const double scale = std::min(4.0, basis.pixels / std::max(state.weight, 1.0));
     std::array<double, 6> step{};
     for (std::size_t i = 0; i < 6; ++i)
-      for (std::size_t j = 0; j < 6; ++j) step[i] += scale * inverse[6 * i + j] * state.sums[j];
+      for (std::size_t j = 0; j < 6; ++j) step[i] += scale * basis.inverse[6 * i + j] * state.sums[j];
     const double max_step = 0.5 * settings.radius;
     step[0] = std::clamp(step[0], -max_step, max_step), step[1] = std::clamp(step[1], -max_step, max_step);
     state.x += float(step[0]), state.y += float(step[1]), state.a += float(step[2]);
     state.b = std::clamp(state.b * float(1 + std::clamp(step[3], -0.5, 1.0)), 1.0f, 512.0f);
     state.slope_x += float(step[4]), state.slope_y += float(step[5]);
-    const bool diverged = !(std::abs(state.x - begin.x) < limit && std::abs(state.y - begin.y) < limit) ||
+    const Point position = centre + Point{state.x, state.y}, off = position - start.position;
+    const bool diverged = !(std::abs(off.x) < limit && std::abs(off.y) < limit) ||
                           !(state.a * rest_contrast > 0.01 * rest_contrast * rest_contrast);
-    if (diverged) return {position, 0, 0};
+    if (diverged) return {start.position, 0, 0};
     const double moved = std::max(std::abs(step[0]), std::abs(step[1]));
-    const bool settled = std::abs(step[2]) < contrast_tolerance * std::abs(rest_contrast);
+    const double lit = std::abs(step[3]) + 0.5 * basis.window * (std::abs(step[4]) + std::abs(step[5]));
+    const bool settled = std::abs(step[2]) < contrast_tolerance * std::abs(rest_contrast) &&
+                         state.b * lit < background_tolerance * state.k;
     if (!coarse && moved < tolerance && settled) break;
     coarse = coarse && moved > coarse_tolerance;
+    if (std::max(std::abs(state.x), std::abs(state.y)) > recentre_distance) {
+      const Point before = centre;
+      centre = window.read(plane, position);
+      state.recentre(centre - before);
+    }
   }
   const double edge = std::max(state.edge, 1e-9);
-  return {corner + Point{state.x, state.y}, state.a, std::clamp(state.edge_weighted / edge, 0.0, 1.0)};
+  return {centre + Point{state.x, state.y}, state.a, std::clamp(state.edge_weighted / edge, 0.0, 1.0)};
 }
 
 }  // namespace gelflow::perception

@@ -3,6 +3,7 @@
 #include <stdexcept>
 
 #include "curvature.hpp"
+#include "deformed_shape.hpp"
 
 namespace gelflow::perception {
 
@@ -25,11 +26,15 @@ constexpr int relaxation_steps = 8;
 constexpr int max_rest_images = 8;      // images averaged in the rest positions
 constexpr double rest_coherence = 0.3;  // largest ratio of coherent to independent squared displacement at rest
 
-// Side of the fit window: wide enough to determine the background slope, without the neighbouring dots.
-int window_size(double radius, double spacing) {
-  const int wanted = int(std::ceil(3.8 * radius / pack_size)) * pack_size,
-            most = int(0.85 * spacing / pack_size) * pack_size;
-  return std::clamp(wanted, pack_size, std::clamp(most, pack_size, Window::largest));
+// Side of the fit window of a dot: wide enough to determine the background slope, without the neighbouring dots. A dot
+// that is far longer than the others, as at the border of a wide-angle image, is not cut.
+int window_size(double radius, double half_length, double spacing) {
+  const auto packs = [](double length) {
+    return int(std::ceil(std::min(double(Window::largest), length) / pack_size)) * pack_size;
+  };
+  const int most = int(0.85 * spacing / pack_size) * pack_size;
+  return std::clamp(std::max(std::min(packs(3.8 * radius), most), packs(2.6 * half_length)), pack_size,
+                    Window::largest);
 }
 // 0 without values.
 template <class Number>
@@ -43,21 +48,23 @@ Number median(std::vector<Number> values) {
 
 Tracker::Tracker(TrackerSetup setup)
     : setup_(std::move(setup)),
-      settings_{setup_.profile, window_size(setup_.radius, setup_.spacing), setup_.radius, setup_.noise},
-      inverse_hessian_(setup_.rest.size()),
+      settings_{setup_.profile, setup_.radius, setup_.noise},
       edge_fit_(setup_.profile, median(setup_.contrast)),
       rest_quality_(setup_.rest.size()),
       plane_(setup_.width, setup_.height),
       detector_(setup_.width, setup_.height, setup_.radius, setup_.spacing, setup_.bright),
       assignment_(setup_.grid, setup_.spacing) {
   const std::size_t n = setup_.rest.size();
-  for (std::size_t m = 0; m < n; ++m)
-    if (!inverse_hessian(setup_.profile, setup_.shape[m], mask(m), setup_.contrast[m], settings_.window,
-                         inverse_hessian_[m]))
-      throw std::invalid_argument("the dot profile does not determine the centre of a dot");
-  for (const DotShape& f : setup_.shape) {  // half width and half height, reduced by 10 % for a blurred edge
+  for (std::size_t m = 0; m < n; ++m) {
+    const DotShape& f = setup_.shape[m];
     const double area = std::abs(double(f.xx) * f.yy - double(f.xy) * f.yx);
-    half_size_.push_back({0.9 * std::hypot(f.xy, f.yy) / area, 0.9 * std::hypot(f.xx, f.yx) / area});
+    const Point half = {std::hypot(f.xy, f.yy) / area, std::hypot(f.xx, f.yx) / area};
+    half_size_.push_back(0.9 * half);  // without the blurred edge
+    const int window = window_size(setup_.radius, std::max(half.x, half.y), setup_.spacing);
+    fit_basis_.push_back(
+        fit_basis(setup_.profile, f, mask(m), setup_.contrast[m], window, setup_.rest[m], setup_.width, setup_.height));
+    if (!(fit_basis_[m].pixels > 0))
+      throw std::invalid_argument("the dot profile does not determine the centre of a dot");
   }
   positions_ = previous_ = setup_.rest;
   shape_ = next_shape_ = setup_.shape;
@@ -176,6 +183,7 @@ void Tracker::measure(const std::vector<int>& dot_of) {
     measured_[m] = 0;
     if (setup_.visible[m]) accept(m, fit(m, {positions_[m], 8}), min_quality);
   }
+  refit_deformed();  // first, since a fit with a wrong shape has a low quality
   reject_outliers();
   if (std::none_of(measured_.begin(), measured_.end(), [](char k) { return k != 0; })) {
     positions_ = previous_;
@@ -212,29 +220,8 @@ void Tracker::accept(std::size_t marker, const DotFit& found, double threshold) 
   positions_[marker] = found.position, quality_[marker] = quality, measured_[marker] = 1;
 }
 
-// The shape of a dot on the deformed gel: its frame is F G with G = L₀ L⁻¹, where the columns of L are the vectors
-// between the opposite neighbours of the marker, and L₀ are those at rest.
 DotShape Tracker::deformed_shape(std::size_t marker) const {
-  Point now[2], rest[2];
-  for (int axis = 0; axis < 2; ++axis) {
-    std::size_t ends[2];
-    for (int side = 0; side < 2; ++side) {
-      const int other = setup_.grid.neighbour(int(marker), (axis ? Grid::downward : Grid::rightward) + side);
-      ends[side] = other < 0 ? marker : std::size_t(other);
-      if (!measured_[ends[side]]) return shape_[marker];
-    }
-    now[axis] = positions_[ends[0]] - positions_[ends[1]];
-    rest[axis] = setup_.rest[ends[0]] - setup_.rest[ends[1]];
-  }
-  const double area = now[0].x * now[1].y - now[0].y * now[1].x;
-  if (!(area > 0.3 * (rest[0].x * rest[1].y - rest[0].y * rest[1].x))) return shape_[marker];
-  const double xx = (rest[0].x * now[1].y - rest[1].x * now[0].y) / area;
-  const double xy = (rest[1].x * now[0].x - rest[0].x * now[1].x) / area;
-  const double yx = (rest[0].y * now[1].y - rest[1].y * now[0].y) / area;
-  const double yy = (rest[1].y * now[0].x - rest[0].y * now[1].x) / area;
-  const DotShape& f = setup_.shape[marker];
-  return {float(f.xx * xx + f.xy * yx), float(f.xx * xy + f.xy * yy), float(f.yx * xx + f.yy * yx),
-          float(f.yx * xy + f.yy * yy), f.waves};
+  return deformed({setup_.grid, setup_.rest, positions_, measured_}, marker, setup_.shape[marker], shape_[marker]);
 }
 
 // Moves the measured positions from the centres of the outlines to those of the dots.
@@ -266,7 +253,7 @@ DotFit Tracker::fit(std::size_t marker, const FitStart& start) const {
   if (!(position.x > -setup_.radius && position.y > -setup_.radius && position.x < setup_.width + setup_.radius &&
         position.y < setup_.height + setup_.radius))
     return {position, 0, 0};
-  const DotFit found = fit_dot(plane_, settings_, shape_[marker], mask(marker), inverse_hessian_[marker],
+  const DotFit found = fit_dot(plane_, settings_, shape_[marker], mask(marker), fit_basis_[marker],
                                setup_.contrast[marker], setup_.tolerated[marker], start);
   if (!(found.quality > 0) || found.quality > uneven_light_quality * rest_quality_[marker]) return found;
   DotFit improved =

@@ -69,7 +69,7 @@ class Tracker {
 
   TrackerSetup setup_;
   FitSettings settings_;
-  std::vector<InverseHessian> inverse_hessian_;
+  std::vector<FitBasis> fit_basis_;
   EdgeFit edge_fit_;
   std::vector<double> rest_quality_;  // of the fits at rest
   std::vector<DotShape> shape_;       // of the dots on the deformed gel

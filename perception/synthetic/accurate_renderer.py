@@ -148,7 +148,7 @@ class AccurateGelRenderer:
         appearance = self.appearance
         shape = (appearance.grid.rows, appearance.grid.cols, 2)
         now, rest = undistorted.reshape(shape), self._undistorted.reshape(shape)
-        stretched, straight = (np.stack(np.gradient(at, axis=(0, 1)), axis=-1) for at in (now, rest))
+        stretched, straight = (np.stack([_derivative(at, 0), _derivative(at, 1)], axis=-1) for at in (now, rest))
         steps = np.linalg.inv(straight)  # rows and columns per pixel
         gel = (stretched @ steps).reshape(-1, 2, 2)
         warp = appearance.warp
@@ -161,12 +161,21 @@ class AccurateGelRenderer:
         return warp(undistorted + self._print.offset), shapes, curvatures
 
 
+def _derivative(values: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
+    """Derivative by row (0) or column (1), in units of the grid: of fourth order, near the border of second order."""
+    along = np.moveaxis(values, axis, 0)
+    result = np.gradient(along, axis=0, edge_order=min(2, len(along) - 1))
+    if len(along) > 4:
+        result[2:-2] = (8 * (along[3:-1] - along[1:-3]) - (along[4:] - along[:-4])) / 12
+    return np.moveaxis(result, 0, axis)
+
+
 def _second_differences(displacement: Points) -> NDArray[np.float64]:
     """Second differences by row and column, shape (rows, cols, 2, 2, 2), 0 where a neighbour is missing."""
     second = np.zeros((*displacement.shape, 2, 2))
     second[1:-1, :, :, 0, 0] = np.diff(displacement, 2, axis=0)
     second[:, 1:-1, :, 1, 1] = np.diff(displacement, 2, axis=1)
-    second[..., 0, 1] = second[..., 1, 0] = np.gradient(np.gradient(displacement, axis=0), axis=1)
+    second[..., 0, 1] = second[..., 1, 0] = _derivative(_derivative(displacement, 0), 1)
     return second
 
 

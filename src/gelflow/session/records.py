@@ -24,7 +24,7 @@ from gelflow.task import InsertionTask
 
 FORMAT = 1
 SENSORS = ("left", "right")  # topic names of sensor 0 and 1
-TRACKER_VERSION = "5"  # increases with each change of what the marker tracker measures
+TRACKER_VERSION = "6"  # increases with each change of what the marker tracker measures
 VERSIONED_PACKAGES = ("numpy", "scipy", "torch", "opencv-contrib-python-headless", "mcap", "protobuf")
 _NUMBERS = re.compile(r"\[(\n[-+.,\deE\s]+)\]")  # a list of numbers in indented JSON
 Record = TypeVar("Record")

@@ -31,6 +31,13 @@ def centroids(picture: np.ndarray, centers: np.ndarray, reach: int) -> np.ndarra
     return found
 
 
+def areas(picture: np.ndarray, centers: np.ndarray, reach: int) -> np.ndarray:
+    """Sum of the ink within `reach` pixels of each of `centers`, for uniform light."""
+    ink = picture[..., 1] - np.median(picture[..., 1])
+    squares = [ink[y - reach : y + reach + 1, x - reach : x + reach + 1] for x, y in np.rint(centers).astype(int)]
+    return np.array([square.sum() for square in squares])
+
+
 @pytest.mark.parametrize(
     "changed",
     [
@@ -78,6 +85,8 @@ def test_dots_deform_like_the_image_of_the_gel(oval: float) -> None:
     found, expected = (centroids(picture, curved.position, reach=22) for picture in (curved.picture, warped))
     assert np.linalg.norm(expected - curved.position, axis=1)[inner].min() > 0.03
     assert np.abs(found - expected)[inner].max() < 0.006
+    area, expected_area = (areas(picture, curved.position, reach=22) for picture in (curved.picture, warped))
+    assert np.abs(area / expected_area - 1).max() < 0.01  # also at the border
 
 
 def test_printed_dots_are_off_the_grid() -> None:
