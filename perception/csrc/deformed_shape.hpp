@@ -23,14 +23,16 @@ struct GridStep {
 // They are central ones of fourth order where the neighbours are measured, and one-sided ones of second order at the
 // border of the grid. False where a next neighbour is not measured.
 inline bool find_step(const MarkerPositions& positions, std::size_t marker, bool downward, GridStep& step) {
-  const auto at = [&](int steps) {
-    return positions.grid.neighbour(int(marker), downward ? Grid::downward : Grid::rightward, steps);
+  const Grid& grid = positions.grid;
+  const int m = int(marker), at = downward ? m / grid.cols : m % grid.cols, count = downward ? grid.rows : grid.cols;
+  const auto other = [&](int steps) { return std::size_t(m + steps * (downward ? grid.cols : 1)); };
+  const auto is_measured = [&](int steps) {
+    return at + steps >= 0 && at + steps < count && positions.measured[other(steps)];
   };
-  const auto is_measured = [&](int steps) { return at(steps) >= 0 && positions.measured[std::size_t(at(steps))]; };
   std::array<double, 5> weights;  // of the markers from two steps behind to two steps ahead
-  if (at(-1) < 0)
+  if (at == 0)
     weights = is_measured(2) ? std::array{0.0, 0.0, -3.0, 4.0, -1.0} : std::array{0.0, 0.0, -1.0, 1.0, 0.0};
-  else if (at(1) < 0)
+  else if (at == count - 1)
     weights = is_measured(-2) ? std::array{1.0, -4.0, 3.0, 0.0, 0.0} : std::array{0.0, -1.0, 1.0, 0.0, 0.0};
   else if (is_measured(-2) && is_measured(2))
     weights = {1.0, -8.0, 0.0, 8.0, -1.0};
@@ -41,8 +43,8 @@ inline bool find_step(const MarkerPositions& positions, std::size_t marker, bool
     const double weight = weights[std::size_t(steps + 2)];
     if (weight == 0) continue;
     if (!is_measured(steps)) return false;
-    const auto other = std::size_t(at(steps));
-    step.rest = step.rest + weight * positions.rest[other], step.now = step.now + weight * positions.now[other];
+    step.rest = step.rest + weight * positions.rest[other(steps)];
+    step.now = step.now + weight * positions.now[other(steps)];
   }
   return true;
 }

@@ -184,12 +184,12 @@ void Tracker::measure(const std::vector<int>& dot_of) {
     if (setup_.visible[m]) accept(m, fit(m, {positions_[m], 8}), min_quality);
   }
   refit_deformed();  // first, since a fit with a wrong shape has a low quality
-  reject_outliers();
+  const bool rejected = reject_outliers();
   if (std::none_of(measured_.begin(), measured_.end(), [](char k) { return k != 0; })) {
     positions_ = previous_;
     return;
   }
-  refit_deformed();
+  if (rejected) refit_deformed();
   fill_missing();
   for (std::size_t m = 0; m < n; ++m) {
     if (measured_[m] || !setup_.visible[m]) continue;
@@ -291,8 +291,10 @@ bool Tracker::is_unoccupied(int marker, Point position) const {
   return true;
 }
 
-// Rejects fits that differ from the extrapolation of the neighbours; the limit grows with the cube of the quality.
-void Tracker::reject_outliers() {
+// Rejects fits that differ from the extrapolation of the neighbours; the limit grows with the cube of the quality. True
+// if there are any.
+bool Tracker::reject_outliers() {
+  bool any = false;
   for (std::size_t m = 0; m < displacement_.size(); ++m) displacement_[m] = positions_[m] - setup_.rest[m];
   filled_ = measured_;
   for (std::size_t m = 0; m < displacement_.size(); ++m) {
@@ -300,8 +302,9 @@ void Tracker::reject_outliers() {
     double deviation;
     if (!filled_[m] || quality_[m] > trusted_quality || !extrapolate(int(m), predicted, deviation)) continue;
     const double limit = outlier_distance * quality_[m] * quality_[m] * quality_[m] * setup_.spacing + deviation;
-    if (squared(displacement_[m] - predicted) > limit * limit) measured_[m] = 0, quality_[m] = 0;
+    if (squared(displacement_[m] - predicted) > limit * limit) measured_[m] = 0, quality_[m] = 0, any = true;
   }
+  return any;
 }
 
 // Predicts the displacement of `marker` as the median of the linear interpolations and extrapolations from pairs of

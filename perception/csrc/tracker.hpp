@@ -61,7 +61,7 @@ class Tracker {
   double accepted_quality(std::size_t marker, const DotFit& fit) const;
   bool is_inside(std::size_t marker, Point position) const;
   bool is_unoccupied(int marker, Point position) const;
-  void reject_outliers();
+  bool reject_outliers();
   bool extrapolate(int marker, Point& predicted, double& deviation) const;
   bool neighbour_mean(int marker, Point& mean) const;
   void fill_missing();

@@ -164,7 +164,7 @@ class AccurateGelRenderer:
 def _derivative(values: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
     """Derivative by row (0) or column (1), in units of the grid: of fourth order, near the border of second order."""
     along = np.moveaxis(values, axis, 0)
-    result = np.gradient(along, axis=0, edge_order=min(2, len(along) - 1))
+    result = np.gradient(along, axis=0, edge_order=2 if len(along) > 2 else 1)
     if len(along) > 4:
         result[2:-2] = (8 * (along[3:-1] - along[1:-3]) - (along[4:] - along[:-4])) / 12
     return np.moveaxis(result, 0, axis)
