@@ -303,7 +303,7 @@ inline void start_background(const Window& window, int width, int height, bool w
 
 // Fits one dot. `rest_contrast` is the contrast for which H⁻¹ was computed, `tolerated` the scale of the robust weight k
 // relative to background times contrast. Without a `mask`, the shape describes the whole dot. The quality is 0 when the
-// fit leaves the central part of the window or the contrast changes sign.
+// fit moves far from its start or the contrast far from that at rest.
 inline DotFit fit_dot(const Plane& plane, const FitSettings& settings, const DotShape& shape, const DotMask* mask,
                       const FitBasis& basis, double rest_contrast, double tolerated, const FitStart& start) {
   const double limit = 0.8 * settings.radius + 1;
@@ -330,8 +330,8 @@ inline DotFit fit_dot(const Plane& plane, const FitSettings& settings, const Dot
     state.b = std::clamp(state.b * float(1 + std::clamp(step[3], -0.5, 1.0)), 1.0f, 512.0f);
     state.slope_x += float(step[4]), state.slope_y += float(step[5]);
     const Point position = centre + Point{state.x, state.y}, off = position - start.position;
-    const bool diverged = !(std::abs(off.x) < limit && std::abs(off.y) < limit) ||
-                          !(state.a * rest_contrast > 0.01 * rest_contrast * rest_contrast);
+    const double ratio = state.a / rest_contrast;
+    const bool diverged = !(std::abs(off.x) < limit && std::abs(off.y) < limit && ratio > 0.01 && ratio < 100);
     if (diverged) return {start.position, 0, 0};
     const double moved = std::max(std::abs(step[0]), std::abs(step[1]));
     const double lit = std::abs(step[3]) + 0.5 * basis.window * (std::abs(step[4]) + std::abs(step[5]));
