@@ -334,9 +334,9 @@ inline DotFit fit_dot(const Plane& plane, const FitSettings& settings, const Dot
     const bool diverged = !(std::abs(off.x) < limit && std::abs(off.y) < limit && ratio > 0.01 && ratio < 100);
     if (diverged) return {start.position, 0, 0};
     const double moved = std::max(std::abs(step[0]), std::abs(step[1]));
-    const double lit = std::abs(step[3]) + 0.5 * basis.window * (std::abs(step[4]) + std::abs(step[5]));
+    const double background = std::abs(step[3]) + 0.5 * basis.window * (std::abs(step[4]) + std::abs(step[5]));
     const bool settled = std::abs(step[2]) < contrast_tolerance * std::abs(rest_contrast) &&
-                         state.b * lit < background_tolerance * state.k;
+                         state.b * background < background_tolerance * state.k;
     if (!coarse && moved < tolerance && settled) break;
     coarse = coarse && moved > coarse_tolerance;
     if (std::max(std::abs(state.x), std::abs(state.y)) > recentre_distance) {
