@@ -24,7 +24,7 @@ _RINGS = 44  # bins of the radius in which the profile is averaged
 
 
 class DotWindows:
-    """Pixel windows around the visible dots: values, offsets from the initial centre, and fitted background."""
+    """Square pixel windows around the visible dots, as large as the longest dot requires."""
 
     def __init__(self, plane: Floats, grid: MarkerGrid) -> None:
         self.markers = np.flatnonzero(grid.visible)
@@ -38,7 +38,7 @@ class DotWindows:
         self.inner = np.flatnonzero(_length(*self.step) < max(1.6 * grid.radius, 1.2 * longest) + 1)
 
     def _read(self, plane: Floats, radius: float, half: float) -> None:
-        """Reads windows of the side 2 `half` [px]."""
+        """Reads the pixels up to `half` [px] away from the centres."""
         half = int(np.ceil(half))
         padded = cv2.copyMakeBorder(plane, half, half, half, half, cv2.BORDER_REPLICATE)
         sampling = max(1, round(radius / 3.7))  # [px], about 3 samples a radius: denser ones add no information
