@@ -1,6 +1,7 @@
 // The shape of a dot on a deformed gel.
 #pragma once
 
+#include <optional>
 #include <vector>
 
 #include "dot_fit.hpp"
@@ -21,8 +22,8 @@ struct GridStep {
 
 // Finite differences of the positions at a marker, to the right or `downward` in the grid; both have the same factor.
 // They are central ones of fourth order where the neighbours are measured, and one-sided ones of second order at the
-// border of the grid. False where a next neighbour is not measured.
-inline bool find_step(const MarkerPositions& positions, std::size_t marker, bool downward, GridStep& step) {
+// border of the grid. Nothing where a next neighbour is not measured.
+inline std::optional<GridStep> find_step(const MarkerPositions& positions, std::size_t marker, bool downward) {
   const Grid& grid = positions.grid;
   const int m = int(marker), at = downward ? m / grid.cols : m % grid.cols, count = downward ? grid.rows : grid.cols;
   const auto other = [&](int steps) { return std::size_t(m + steps * (downward ? grid.cols : 1)); };
@@ -38,29 +39,29 @@ inline bool find_step(const MarkerPositions& positions, std::size_t marker, bool
     weights = {1.0, -8.0, 0.0, 8.0, -1.0};
   else
     weights = {0.0, -1.0, 0.0, 1.0, 0.0};
-  step = {};
+  GridStep step;
   for (int steps = -2; steps <= 2; ++steps) {
     const double weight = weights[std::size_t(steps + 2)];
     if (weight == 0) continue;
-    if (!is_measured(steps)) return false;
+    if (!is_measured(steps)) return {};
     step.rest = step.rest + weight * positions.rest[other(steps)];
     step.now = step.now + weight * positions.now[other(steps)];
   }
-  return true;
+  return step;
 }
 
 // The shape `f` of a marker's dot on the deformed gel: its frame is F G with G = L₀ L⁻¹, where the columns of L are the
 // steps to the right and downward in the grid, and L₀ are those at rest. `unknown` where they cannot be measured.
 inline DotShape deformed(const MarkerPositions& positions, std::size_t marker, const DotShape& f,
                          const DotShape& unknown) {
-  GridStep right, down;
-  if (!find_step(positions, marker, false, right) || !find_step(positions, marker, true, down)) return unknown;
-  const double area = right.now.x * down.now.y - right.now.y * down.now.x;
-  if (!(area > 0.3 * (right.rest.x * down.rest.y - right.rest.y * down.rest.x))) return unknown;
-  const double xx = (right.rest.x * down.now.y - down.rest.x * right.now.y) / area;
-  const double xy = (down.rest.x * right.now.x - right.rest.x * down.now.x) / area;
-  const double yx = (right.rest.y * down.now.y - down.rest.y * right.now.y) / area;
-  const double yy = (down.rest.y * right.now.x - right.rest.y * down.now.x) / area;
+  const std::optional<GridStep> right = find_step(positions, marker, false), down = find_step(positions, marker, true);
+  if (!right || !down) return unknown;
+  const double area = right->now.x * down->now.y - right->now.y * down->now.x;
+  if (!(area > 0.3 * (right->rest.x * down->rest.y - right->rest.y * down->rest.x))) return unknown;
+  const double xx = (right->rest.x * down->now.y - down->rest.x * right->now.y) / area;
+  const double xy = (down->rest.x * right->now.x - right->rest.x * down->now.x) / area;
+  const double yx = (right->rest.y * down->now.y - down->rest.y * right->now.y) / area;
+  const double yy = (down->rest.y * right->now.x - right->rest.y * down->now.x) / area;
   return {float(f.xx * xx + f.xy * yx), float(f.xx * xy + f.xy * yy), float(f.yx * xx + f.yy * yx),
           float(f.yx * xy + f.yy * yy), f.waves};
 }

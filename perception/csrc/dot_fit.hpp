@@ -154,14 +154,12 @@ GELFLOW_INLINE FloatPack sample_mask(const DotMask& mask, FloatPack x, FloatPack
   return weight;
 }
 
-GELFLOW_INLINE FloatPack magnitude(FloatPack v) { return v < 0 ? -v : v; }
-
-// Part of a pixel that is within the square around a dot; `distance`: from the border of the square [px].
-GELFLOW_INLINE FloatPack taper(FloatPack distance) {
-  const FloatPack positive = distance > 0 ? distance : FloatPack{};
-  return positive < 1 ? positive : FloatPack{} + 1;
+// Part of each pixel that is within the square of the side `size` around a dot; `dx`, `dy`: from its centre [px].
+GELFLOW_INLINE FloatPack within_square(int size, FloatPack dx, float dy) {
+  const FloatPack beside = 0.5f * float(size) - (dx < 0 ? -dx : dx), positive = beside > 0 ? beside : FloatPack{};
+  const float above = std::clamp(0.5f * float(size) - std::abs(dy), 0.0f, 1.0f);
+  return above * (positive < 1 ? positive : FloatPack{} + 1);
 }
-GELFLOW_INLINE FloatPack taper(float distance) { return FloatPack{} + std::clamp(distance, 0.0f, 1.0f); }
 
 // `weight` where `column` is inside the image, else 0.
 GELFLOW_INLINE FloatPack inside(FloatPack column, int width, FloatPack weight) {
@@ -181,7 +179,6 @@ GELFLOW_CLONES inline void accumulate(const Window& window, int width, int heigh
   for (int row = std::max(0, -window.top); row < std::min(window.size, height - window.top); row += state.row_step) {
     const float y = float(row) - middle;
     const float* line = &window.pixels[std::size_t(row * window.size)];
-    const FloatPack near = taper(middle + 0.5f - std::abs(y - state.y));
     for (int start = 0; start < window.size; start += pack_size) {
       const FloatPack x = pack_ramp + (float(start) - middle), dx = x - state.x;
       FloatPack pixel;
@@ -189,7 +186,7 @@ GELFLOW_CLONES inline void accumulate(const Window& window, int width, int heigh
       const ProfileSample dot = sample_profile(profile, shape, dx, y - state.y);
       const FloatPack ink = 1 + state.a * dot.s;
       const FloatPack r = pixel - state.b * (1 + state.slope_x * x + state.slope_y * y) * ink;
-      FloatPack used = near * taper(middle + 0.5f - magnitude(dx));
+      FloatPack used = within_square(window.size, dx, y - state.y);
       if (mask) used *= sample_mask(*mask, dot.x, dot.y);
       const FloatPack w = inside(x + (middle + float(window.left)), width, used) / (1 + r * r * k2);
       const FloatPack square = used * (dot.gx * dot.gx + dot.gy * dot.gy);
@@ -254,8 +251,7 @@ GELFLOW_CLONES inline FitBasis fit_basis(const DotProfile& profile, const DotSha
       const float y = float(row) - middle;
       if (y + float(rest.y) < 0 || y + float(rest.y) > float(height - 1)) continue;
       const ProfileSample dot = sample_profile(profile, shape, x, y);
-      FloatPack used =
-          inside(x + float(rest.x), width, taper(middle + 0.5f - std::abs(y)) * taper(middle + 0.5f - magnitude(x)));
+      FloatPack used = inside(x + float(rest.x), width, within_square(window, x, y));
       if (mask) used *= sample_mask(*mask, dot.x, dot.y);
       const FloatPack ink = 1 + a * dot.s;
       const std::array<FloatPack, 6> j = {a * dot.gx, a * dot.gy, dot.s, ink, ink * x, ink * y};
@@ -283,7 +279,8 @@ struct FitStart {
   bool is_close = false;  // to the solution: no iterations with every second line
 };
 
-// The background along the border of the window, a sufficient initial value; without pixels outside the image.
+// The background along the border of the window, a sufficient initial value; without pixels outside the image. Its slope
+// saves a step where the fit begins close to the dot, and misleads other fits where a highlight is at the border.
 inline void start_background(const Window& window, int width, int height, bool with_slope, FitState& state) {
   double sum = 0, count = 0, across = 0, down = 0;
   const int size = window.size;

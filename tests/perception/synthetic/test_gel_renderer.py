@@ -20,10 +20,15 @@ EVEN: dict[str, Any] = {
 }
 
 
+def ink_of(picture: np.ndarray) -> np.ndarray:
+    """Difference from the gel, for uniform light."""
+    return np.asarray(picture[..., 1] - np.median(picture[..., 1]))
+
+
 def centroids(picture: np.ndarray, centers: np.ndarray, reach: int) -> np.ndarray:
     """Centroid of the ink within `reach` pixels of each of `centers`, for uniform light."""
     found = np.zeros_like(centers)
-    ink = picture[..., 1] - np.median(picture[..., 1])
+    ink = ink_of(picture)
     for k, (right, down) in enumerate(np.rint(centers).astype(int)):
         y, x = np.mgrid[down - reach : down + reach + 1, right - reach : right + reach + 1]
         patch = ink[y, x]
@@ -33,7 +38,7 @@ def centroids(picture: np.ndarray, centers: np.ndarray, reach: int) -> np.ndarra
 
 def areas(picture: np.ndarray, centers: np.ndarray, reach: int) -> np.ndarray:
     """Sum of the ink within `reach` pixels of each of `centers`, for uniform light."""
-    ink = picture[..., 1] - np.median(picture[..., 1])
+    ink = ink_of(picture)
     squares = [ink[y - reach : y + reach + 1, x - reach : x + reach + 1] for x, y in np.rint(centers).astype(int)]
     return np.array([square.sum() for square in squares])
 
