@@ -116,18 +116,18 @@ TrackerSetup make_setup(int width, int height, int channel, bool bright, int row
 
 StartResult start(SharedTracker& shared, const Image& image) {
   const std::uint8_t* pixels = shared.pixels(image);
-  {
-    py::gil_scoped_release release;
-    const std::lock_guard lock(shared.mutex);
-    shared.tracker.start(pixels);
-  }
   const py::ssize_t n = shared.tracker.markers();
   StartResult out{py::array_t<double>({n, py::ssize_t(2)}), py::array_t<double>(n), py::array_t<double>(n)};
+  auto position = out.position.mutable_unchecked<2>();
+  auto contrast = out.contrast.mutable_unchecked<1>(), quality = out.quality.mutable_unchecked<1>();
+  py::gil_scoped_release release;
+  const std::lock_guard lock(shared.mutex);
+  shared.tracker.start(pixels);
   for (py::ssize_t m = 0; m < n; ++m) {
     const std::size_t i = std::size_t(m);
-    const Point position = shared.tracker.positions()[i];
-    out.position.mutable_at(m, 0) = position.x, out.position.mutable_at(m, 1) = position.y;
-    out.contrast.mutable_at(m) = shared.tracker.contrasts()[i], out.quality.mutable_at(m) = shared.tracker.quality()[i];
+    const Point found = shared.tracker.positions()[i];
+    position(m, 0) = found.x, position(m, 1) = found.y;
+    contrast(m) = shared.tracker.contrasts()[i], quality(m) = shared.tracker.quality()[i];
   }
   return out;
 }

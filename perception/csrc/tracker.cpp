@@ -20,8 +20,8 @@ constexpr double min_response_ratio = 0.3;  // minimum response of a dot / media
 constexpr double max_velocity = 0.25;       // in spacings per image; larger steps are jumps, without prediction
 constexpr double trusted_quality = 0.8;     // from this quality on, a fit is not compared with the neighbours
 constexpr double outlier_distance = 0.4;    // in spacings: limit for a fit of quality 1
-constexpr float frame_change = 0.05f;       // relative change of a frame that detected dots resolve
-constexpr float refit_change = 0.01f;       // relative change of a frame that a dot is fitted again for
+constexpr float resolved_change = 0.05f;    // relative change of a shape that detected dots resolve
+constexpr float refit_change = 0.01f;       // relative change of a shape for which a dot is fitted again
 constexpr int relaxation_steps = 8;
 constexpr int max_rest_images = 8;      // images averaged in the rest positions
 constexpr double rest_coherence = 0.3;  // largest ratio of coherent to independent squared displacement at rest
@@ -63,9 +63,11 @@ Tracker::Tracker(TrackerSetup setup)
     const int window = window_size(setup_.radius, std::max(half.x, half.y), setup_.spacing);
     fit_basis_.push_back(
         fit_basis(setup_.profile, f, mask(m), setup_.contrast[m], window, setup_.rest[m], setup_.width, setup_.height));
-    if (!(fit_basis_[m].pixels > 0))
-      throw std::invalid_argument("the dot profile does not determine the centre of a dot");
+    if (!(fit_basis_[m].pixels > 0)) setup_.visible[m] = 0;  // outside the image, or behind its mask
   }
+  const auto determined = [](const FitBasis& basis) { return basis.pixels > 0; };
+  if (std::none_of(fit_basis_.begin(), fit_basis_.end(), determined))
+    throw std::invalid_argument("the dot profile does not determine the centre of a dot");
   positions_ = previous_ = setup_.rest;
   shape_ = next_shape_ = setup_.shape;
   velocity_.resize(n), displacement_.resize(n), relaxed_.resize(n), detection_offset_.resize(n);
@@ -175,7 +177,7 @@ void Tracker::measure(const std::vector<int>& dot_of) {
   }
   for (std::size_t m = 0; m < n; ++m) {
     const DotShape now = deformed_shape(m);
-    if (differ(now, shape_[m], frame_change)) shape_[m] = now;
+    if (differ(now, shape_[m], resolved_change)) shape_[m] = now;
   }
   for (std::size_t m = 0; m < n; ++m) {
     quality_[m] = 0;
@@ -202,8 +204,8 @@ void Tracker::measure(const std::vector<int>& dot_of) {
   for (std::size_t m = 0; m < n; ++m) shape_[m] = deformed_shape(m);
 }
 
-// Fits those dots again whose shape by the fitted positions differs from that of their fit, which is the last image's
-// where detected dots do not resolve the change.
+// Fits a dot again where the shape by the fitted positions differs from that of its fit. The latter may be that of the
+// last image, since detected dots do not resolve small changes.
 void Tracker::refit_deformed() {
   for (std::size_t m = 0; m < positions_.size(); ++m) next_shape_[m] = deformed_shape(m);
   for (std::size_t m = 0; m < positions_.size(); ++m) {
@@ -236,7 +238,7 @@ Point Tracker::outline_offset(std::size_t marker) const {
   return curvature_offset(motion, marker, setup_.shape[marker], shape_[marker]);
 }
 
-// Whether two frames differ by more than `change`, relative to the second.
+// Whether two shapes differ by more than `change`, relative to the second.
 bool Tracker::differ(const DotShape& one, const DotShape& two, float change) {
   const float limit = change * std::sqrt(two.xx * two.xx + two.xy * two.xy + two.yx * two.yx + two.yy * two.yy);
   return std::abs(one.xx - two.xx) > limit || std::abs(one.xy - two.xy) > limit || std::abs(one.yx - two.yx) > limit ||

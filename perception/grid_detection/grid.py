@@ -188,6 +188,9 @@ def _rejection_reason(lattice: Lattice | None, dots: DetectedDots, polarity: Pol
     """The reason why `lattice` is not a grid of markers; empty if it may be one."""
     if lattice is None or lattice.irregularity > _MAX_IRREGULARITY:
         return f"no regular grid of markers found in the image{_hint(polarity)}"
+    if lattice.dots.size > _MAX_DOTS:  # the weaker dots of such a grid are omitted
+        rows, cols = lattice.dots.shape
+        return f"{rows} × {cols} dots detected, a grid of markers has at most {_MAX_DOTS}"
     between = _count_between(lattice, dots)
     if between > _MAX_BETWEEN * lattice.dot_count:
         return (

@@ -20,13 +20,17 @@ STILL = np.zeros((252, 2))
 
 @dataclass(frozen=True)
 class View(DegradedGelAppearance):
-    """A gel seen through a lens, with its centre moved by `shift` in the image [px]."""
+    """A gel seen through a lens, moved by `shift` [px] and then rotated by `turn` [rad] in the image."""
 
     lens: Lens = field(default_factory=Lens)
     shift: tuple[float, float] = (0.0, 0.0)
+    turn: float = 0.0
 
     def warp(self, positions: np.ndarray) -> np.ndarray:
-        return self.lens.apply(np.asarray(positions) + self.shift, self)
+        middle = np.array([(self.width - 1) / 2, (self.height - 1) / 2])
+        cos, sin = np.cos(self.turn), np.sin(self.turn)
+        turned = (np.asarray(positions) + self.shift - middle) @ np.array([[cos, sin], [-sin, cos]]) + middle
+        return self.lens.apply(turned, self)
 
 
 def view(preset: str = "typical", zoom: float = 1.0, grid: Grid = GELSLIM_GRID, **changed: object) -> View:
@@ -96,6 +100,17 @@ def test_the_visible_lines_are_found_or_listed_and_no_marker_is_exchanged(seed: 
             error = np.linalg.norm(first.position - now[window].reshape(-1, 2), axis=1)
             assert (error[first.valid] < 0.15 * first.spacing).all()
             assert first.valid.sum() > 0.85 * seen[window].sum()
+
+
+@pytest.mark.parametrize("given", [True, False])
+@pytest.mark.parametrize(("degrees", "zoom"), [(4.0, 1.1), (8.0, 1.0), (14.0, 1.0)])
+def test_grids_whose_corners_are_outside_the_image_are_measured(degrees: float, zoom: float, *, given: bool) -> None:
+    turned = view(zoom=zoom, turn=np.radians(degrees))
+    frame, position, visible = shown(turned)
+    first = MarkerTracker(TrackerConfig(18, 14, False) if given else TrackerConfig()).start(frame.image)
+    assert first.valid.sum() > 0.85 * visible.sum() and not first.valid.all()
+    distance = np.linalg.norm(first.position[first.valid][:, None] - position.reshape(-1, 2), axis=2)
+    assert distance.min(1).max() < 0.15 * first.spacing
 
 
 @pytest.mark.parametrize("shift", [0.5, 1.0, -1.0])
@@ -197,7 +212,7 @@ def test_the_error_of_preflight_names_the_lines_to_write() -> None:
         start_at_rest(CameraMount(pixels_per_mm=SCALE), frame.image)
     assert start_at_rest(CameraMount(pixels_per_mm=SCALE, visible_cols=(3, 14)), frame.image).cols == 12
     near, *_ = shown(view(zoom=1.2))
-    with pytest.raises(PeerError, match=r"does not tell which lines .* visible_cols = \[2, 13\], or "):
+    with pytest.raises(PeerError, match=r"does not show which lines .* visible_cols = \[2, 13\], or "):
         start_at_rest(CameraMount(pixels_per_mm=1.2 * SCALE), near.image)
     with pytest.raises(PeerError, match="shows 90 of 252 markers, at least 40% are required"):
         start_at_rest(CameraMount(pixels_per_mm=SCALE, visible_rows=(1, 9), visible_cols=(5, 14)), frame.image)
