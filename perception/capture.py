@@ -18,7 +18,6 @@ from gelflow.errors import PeerError, PeerTimeout
 
 Image = NDArray[np.uint8]
 
-_JPEG = b"\xff\xd8\xff"
 _PORTS = {"http": 80, "https": 443, "rtsp": 554, "rtmp": 1935}  # default ports of the protocols over TCP
 _MISSING, _MISSING_SHARE = 2, 0.02  # images at the end of a video that its container may announce in excess
 _LARGEST_INT = 2**31 - 1  # that OpenCV takes as the number of a camera
@@ -182,8 +181,8 @@ def _read(capture: cv2.VideoCapture) -> Image | bytes | None:
     good, image = capture.read()
     if not good:
         return None
-    if min(image.shape[:2]) == 1 and (data := image.tobytes()).startswith(_JPEG):
-        return data
+    if min(image.shape[:2]) == 1:  # an undecoded image, perhaps a damaged one
+        return image.tobytes()
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if image.ndim == 2 else image, dtype=np.uint8)
 
 

@@ -99,8 +99,8 @@ class CameraMount:
         above, below, left, right = self.skipped
         if self.calibration is None and ((above and below) or (left and right)):
             raise UsageError(
-                "a grid that extends beyond two opposite borders of the image needs a calibration, which tells its "
-                "lines apart: gelflow calibrate-camera"
+                "a grid that extends beyond two opposite borders of the image needs a calibration, which identifies "
+                "its lines: gelflow calibrate-camera"
             )
 
     @property

@@ -150,20 +150,22 @@ def start_at_rest(mount: CameraMount, image: NDArray[np.uint8]) -> TrackingResul
     try:
         rest = MarkerTracker(mount.tracker_config()).start(image)
     except TrackerInitError as error:
-        extent = find_extent(image)  # raises when there is no grid at all
-        raise PeerError(f"{error}; {_advice(mount, extent)}") from None
+        raise PeerError(f"{error}; {_advice(mount, image)}") from None
     visible = int(rest.valid.sum())
     if visible < _MIN_VISIBLE * mount.visible_count:
-        extent = find_extent(image)
-        whole = (extent.rows, extent.cols) == mount.image_grid
-        advice = "check the gel, its light and the camera" if whole else _advice(mount, extent)
-        raise PeerError(f"{visible} of {mount.visible_count} markers are visible; {advice}")
+        raise PeerError(f"{visible} of {mount.visible_count} markers are visible; {_advice(mount, image)}")
     check_scale(mount, rest)
     return rest
 
 
-def _advice(mount: CameraMount, extent: GridExtent) -> str:
-    """The lab file's keys for the part of the printed grid that an image shows."""
+def _advice(mount: CameraMount, image: NDArray[np.uint8]) -> str:
+    """The lab file's keys for the part of the printed grid that an image shows, if it is another one than stated.
+
+    Raises TrackerInitError when the image shows no grid at all.
+    """
+    extent = find_extent(image)
+    if (extent.rows, extent.cols) == mount.image_grid:
+        return "check the gel, its light and the camera"
     skips = extent.possible_skips(*mount.printed_grid)
     if mount.calibration is not None:
         skips = [skipped for skipped in skips if _is_calibrated_part(mount.calibration, extent, skipped)]
@@ -175,7 +177,7 @@ def _advice(mount: CameraMount, extent: GridExtent) -> str:
     several = ", or ".join(lines[:_MAX_CHOICES]) + (", or …" if len(lines) > _MAX_CHOICES else "")
     text = f"write {several} in the lab file"
     if len(lines) > 1:
-        text = f"the image does not tell which lines are outside: look at the gel and {text}"
+        text = f"the image does not show which lines are outside: look at the gel and {text}"
     if mount.calibration is None:
         rows, cols = mount.printed_grid
         text += f", or calibrate the camera with gelflow calibrate-camera --rows {rows} --cols {cols}"

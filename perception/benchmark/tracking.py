@@ -25,7 +25,7 @@ from gelflow.perception.synthetic.error_bound import cramer_rao_errors
 from gelflow.perception.synthetic.sequences import FIELDS, INITIAL_REST, Field, GelSequence
 
 GELFLOW, LUCAS_KANADE, DENSE_FLOW = TRACKERS
-FRAMES, QUICK_FRAMES = 34, 10  # images from rest to the peak
+FRAMES, QUICK_FRAMES = 34, 10  # images from rest to the peak, which is in the last one
 LARGE_PEAK = 0.8  # peak displacement of the sequences for identity switches / spacing
 JUMPS, QUICK_JUMPS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0), (0.4, 0.7)  # displacement within one image / spacing
 RECOVERED = 0.99  # required fraction of recovered markers two images after a jump
@@ -43,7 +43,7 @@ JITTER_BOUND, DRIFT_BOUND, JUMP_BOUND = 0.02, 0.05, 0.7
 def measure_tracking(options: BenchmarkOptions) -> list[Report]:
     """Measures errors, motion and speed.
 
-    With `options.quick`, errors are measured on the three classes with two fields, motion on the class "typical".
+    With `options.quick`, errors are measured on the four classes with two fields, motion on the class "typical".
     """
     classes = CLASSES if options.quick else (*CLASSES, *SIZED, *FACTORED)
     moved = CLASSES[1:2] if options.quick else (*CLASSES, *FACTORED)
@@ -99,9 +99,11 @@ def _errors(images: ImageClass, options: BenchmarkOptions) -> tuple[float, dict[
     """Median of the error bound [px], and the metrics of each tracker. OpenCV runs on the small images only."""
     names = tuple(TRACKERS) if images.size == SMALL else (GELFLOW,)
     frames = QUICK_FRAMES if options.quick else FRAMES
-    tracked = images.track(names, _fields(options), frames=frames)
+    period = 2 * (frames - 1 - INITIAL_REST)
+    tracked = images.track(names, _fields(options), frames=frames, period=period)
     sequences = [
-        GelSequence(images.appearance(FIELDS.index(field)), field, frames=frames) for field in _fields(options)
+        GelSequence(images.appearance(FIELDS.index(field)), field, frames=frames, period=period)
+        for field in _fields(options)
     ]
     bound = float(np.median(np.concatenate([cramer_rao_errors(sequence) for sequence in sequences])))
     return bound, {name: TrackingMetrics.from_sequences(results) for name, results in tracked.items()}

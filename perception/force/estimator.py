@@ -80,7 +80,7 @@ class ForceEstimator:
         self._creep = CreepCorrection(gel.creep, gel.creep_time)
 
     def reset(self) -> None:
-        """Forget the images before."""
+        """Clear the history."""
         self._fit = None
         self._creep.reset()
 

@@ -34,7 +34,7 @@ class ImageForces:
         self.slip: SlipEstimate | None = None  # in the last image; None where the forces are not known
 
     def reset(self) -> None:
-        """Forget the images before, and an observed friction."""
+        """Clear the history, and an observed friction."""
         self._estimator.reset()
         self._slip.reset()
         self.slip = None

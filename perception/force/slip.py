@@ -50,7 +50,7 @@ class SlipEstimate:
     stick_share_deviation: float | None  # standard deviation
     gross: bool  # the whole contact slips
     since: float | None  # stamp of the first image of this gross slip [s]
-    confidence: float  # probability that `gross` is right
+    confidence: float | None  # probability that `gross` is right; None where motion and forces do not show it
     friction: float | None  # coefficient; None while it is not known
     friction_observed: bool  # found from a gross slip, not stated
 
@@ -87,9 +87,9 @@ class SlipEstimator:
         self._slip = PartialSlip(_EXPONENT, _LOAD_NOISE)
 
     def reset(self) -> None:
-        """Forget the images before, and a friction coefficient that they showed."""
+        """Clear the history, and a friction coefficient that it showed."""
         self._friction, self._deviation = self._stated, self._stated_deviation
-        self._forget_contact()
+        self._clear_contact()
 
     def estimate(
         self, force: ForceEstimate | None, displacement: Array, valid: NDArray[np.bool_], stamp: float
@@ -105,9 +105,9 @@ class SlipEstimator:
         """
         weights = None if force is None else np.where(valid, force.normal_field, 0.0)
         if self._history and stamp <= self._history[-1].stamp:
-            self._forget_contact()
+            self._clear_contact()
         if force is None or weights is None or not force.contact or weights.sum() <= 0:
-            self._forget_contact()
+            self._clear_contact()
             if force is None or force.contact:
                 return None
             return SlipEstimate(None, None, False, None, 1.0, self._friction, self._observed())
@@ -119,19 +119,19 @@ class SlipEstimator:
         ratio = self._ratio(force, centre)
         size = float(np.linalg.norm(ratio))
         probability, limit = self._gross_probability(force.shear, size)
-        gross = probability > limit
+        gross = probability is not None and probability > limit
         if not gross:
             self._since = None
         elif self._since is None:
             self._since = stamp
-        self._observe_friction(probability, size)
+        self._observe_friction(probability or 0.0, size)
         share, deviation = self._share(ratio, gross)
         return SlipEstimate(
             stick_share=share,
             stick_share_deviation=deviation,
             gross=gross,
             since=self._since,
-            confidence=probability if gross else 1 - probability,
+            confidence=probability if gross or probability is None else 1 - probability,
             friction=self._friction,
             friction_observed=self._observed(),
         )
@@ -142,14 +142,17 @@ class SlipEstimator:
         lever = float(weights @ np.linalg.norm(self._positions - centre, axis=1)) * self._pitch
         return np.array([*force.shear, force.moment / max(lever, 1e-9)]) / (force.normal * _RATIO_BIAS)
 
-    def _gross_probability(self, shear: Array, size: float) -> tuple[float, float]:
-        """Probability of gross slip, and that from which on it is stated."""
+    def _gross_probability(self, shear: Array, size: float) -> tuple[float | None, float]:
+        """Probability of gross slip, and that from which on it is stated.
+
+        The probability is None where a contact of unknown friction is loaded or has hardly any shear.
+        """
         slide, drag, growth = self._motion(shear)
         cues = [1.0, min(max(slide, -0.05), 0.15), drag / (max(slide, 0.0) + drag + 0.02), min(drag, 0.06)]
         factors: tuple[float, ...] = _MOTION_ONLY
         limit = _GROSS_BY_MOTION
         if self._friction is None and (size < _SMALLEST_FRICTION or growth > _LARGEST_GROWTH):
-            return 0.0, limit
+            return None, limit
         if self._friction is not None and not self._observed():
             cues.append(min(max(size / self._friction, 0.7), 1.02))
             factors, limit = _WITH_LOAD, _GROSS_WITH_LOAD
@@ -192,7 +195,7 @@ class SlipEstimator:
     def _observed(self) -> bool:
         return self._stated is None and self._friction is not None
 
-    def _forget_contact(self) -> None:
+    def _clear_contact(self) -> None:
         self._history.clear()
         self._certain, self._since = [], None
         self._slip = PartialSlip(_EXPONENT, _LOAD_NOISE)

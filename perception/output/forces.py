@@ -59,10 +59,12 @@ def _slip_cells(slip: SlipEstimate | None) -> list[str]:
     return [share, deviation, str(int(slip.gross)), confidence, friction]
 
 
-def slip_text(slip: SlipEstimate | None) -> str:
+def slip_text(force: ForceEstimate | None, slip: SlipEstimate | None) -> str:
     """The slip of a contact in a few words; empty without a contact."""
-    if slip is None or (slip.stick_share is None and not slip.gross and slip.confidence == 1.0):
+    if force is None or slip is None or not force.contact:
         return ""
+    if slip.confidence is None:
+        return "slip unknown"
     if slip.gross:
         return f"gross slip ({100 * slip.confidence:.0f} %)"
     if slip.stick_share is None or slip.stick_share_deviation is None:
@@ -95,7 +97,7 @@ def draw_force(
     force, relative to the largest one; the arrow starts at the centre of pressure and has one pitch of length per
     tenth of the ratio of shear to normal force. Both are red in gross slip.
     """
-    _caption(picture, ", ".join(filter(None, (force_text(force), slip_text(slip)))))
+    _caption(picture, ", ".join(filter(None, (force_text(force), slip_text(force, slip)))))
     if force is None or not force.contact:
         return
     colour = _GROSS_SLIP if slip is not None and slip.gross else _FORCE

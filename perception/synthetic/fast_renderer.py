@@ -13,7 +13,7 @@ from gelflow.perception.synthetic.appearance import GelAppearance
 from gelflow.perception.synthetic.lens import Lens
 
 _NOISE_SHIFTS = 64  # crops of the noise field per axis [px]
-_PHASES = 64  # sprites per pixel and axis: dot positions are rounded to 1/128 px
+_PHASES = 64  # sprites per pixel and axis: dot positions are rounded to 1/64 px
 
 Image = NDArray[np.uint8]
 Map = NDArray[np.float32]

@@ -88,7 +88,6 @@ class SlippingGel:
     shear: Array  # [N], shape (2,)
     stick_share: float  # of the contact area; 0 without a contact
     gross: bool  # no cell sticks
-    area_mm2: float
 
 
 class SlippingLayer:
@@ -113,7 +112,7 @@ class SlippingLayer:
         self._tangential = np.block([[xx, xy], [xy, yy]])
         self._coupling = np.vstack([xz, yz])  # displacement along the surface by pressure
         self._normal = zz
-        self._position, self._area = position[used], pitch**2
+        self._position = position[used]
         self._step_length = 1.0 / float(np.linalg.eigvalsh(self._tangential)[-1])
         self._pressure = np.zeros(used.size)
         self._shear = np.zeros(2 * used.size)
@@ -206,7 +205,6 @@ class SlippingLayer:
             shear=shear.sum(1),
             stick_share=int(sticks.sum()) / count if count else 0.0,
             gross=bool(count and not sticks.any()),
-            area_mm2=count * self._area,
         )
 
 

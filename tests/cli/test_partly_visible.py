@@ -47,7 +47,7 @@ def test_the_lab_file_accepts_the_calibration_of_a_partly_visible_grid(
     assert calibrate(image, tmp_path / "left.json", "--rows", "18", "--cols", "14") == 2
     told = capsys.readouterr().err
     choices = re.findall(r"--visible-rows 1 18 --visible-cols (\d+) (\d+)", told)
-    assert "does not tell which lines" in told and ("1", "12") in choices
+    assert "does not show which lines" in told and ("1", "12") in choices
     options = ["--rows", "18", "--cols", "14", "--visible-rows", "1", "18", "--visible-cols", "1", "12"]
     assert calibrate(image, tmp_path / "left.json", *options, "--json") == 0
     values = json.loads(capsys.readouterr().out)
@@ -103,7 +103,7 @@ def test_track_says_how_many_of_how_many_markers_are_visible(
     near = picture(tmp_path / "near.png", zoom=1.2)
     assert main(["track", near, "--rows", "18", "--cols", "14"]) == 0
     told = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    assert "of 252 printed markers" in told and "the image does not tell which" in told
+    assert "of 252 printed markers" in told and "the image does not show which" in told
 
 
 def mock_robot(view: CameraView) -> MockRobot:

@@ -179,8 +179,9 @@ def test_images_of_a_profile_are_reduced_and_cropped(tmp_path: Path) -> None:
     np.testing.assert_array_equal(seen[3].image, whole[0:32, 12:72])
 
 
-def test_a_damaged_image_of_a_stream_is_skipped_and_counted() -> None:
+@pytest.mark.parametrize("kept", [0, 300])  # without its first bytes it cannot be recognized as a JPEG image
+def test_a_damaged_image_of_a_stream_is_skipped_and_counted(kept: int) -> None:
     sent = [jpeg(number) for number in range(40)]
-    sent[25] = sent[25][:300] + bytes(200) + b"\xff\xd9"
+    sent[25] = sent[25][:kept] + bytes(200) + b"\xff\xd9"
     source, seen, _ = read_stream(Stream(sent))
     assert len(seen) + source.skipped.unreadable == 40

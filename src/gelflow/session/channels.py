@@ -109,7 +109,7 @@ JSON: dict[str, JsonChannel] = {
                 "stick_share_deviation": NUMBER_OR_NULL,
                 "gross_slip": FLAG,
                 "gross_slip_since": NUMBER_OR_NULL,
-                "gross_slip_confidence": NUMBER,
+                "gross_slip_confidence": NUMBER_OR_NULL,
                 "friction": NUMBER_OR_NULL,
                 "friction_observed": FLAG,
             },

@@ -12,6 +12,7 @@ from gelflow.perception.benchmark.slip import SlippingContact, contact_states, m
 from gelflow.perception.force.estimator import ForceEstimator
 from gelflow.perception.force.partial_slip import PartialSlip
 from gelflow.perception.force.slip import SlipEstimate, SlipEstimator
+from gelflow.perception.output.forces import slip_text
 from gelflow.perception.synthetic.slipping_layer import ObjectMotion, RigidObject, SlippingGel, SlippingLayer
 
 GEL = ElasticGel(youngs_modulus=1.5e5, poisson_ratio=0.48, thickness=3e-3)
@@ -58,7 +59,7 @@ def test_share_and_gross_slip_with_known_friction(pulled: list[SlippingGel]) -> 
     first = next(number for number, slip in enumerate(found) if slip.gross)
     assert begin - 2 <= first <= begin + 2  # 40 ms
     last = found[-1]
-    assert last.gross and last.stick_share == 0 and last.since == first / 60 and last.confidence > 0.6
+    assert last.gross and last.stick_share == 0 and last.since == first / 60 and (last.confidence or 0) > 0.6
     assert last.friction == FRICTION and not last.friction_observed
 
 
@@ -76,6 +77,17 @@ def test_an_uncertain_friction_widens_the_deviation(pulled: list[SlippingGel]) -
     sure, unsure = (slips_of(pulled[: middle + 1], friction=FRICTION, deviation=value)[-1] for value in (0.0, 0.2))
     assert sure.stick_share_deviation is not None and unsure.stick_share_deviation is not None
     assert unsure.stick_share_deviation > 2 * sure.stick_share_deviation
+
+
+def test_gross_slip_has_no_confidence_where_it_is_not_evaluated(pulled: list[SlippingGel]) -> None:
+    """With an unknown friction: while the object is pressed, the shear force is small, or the normal force grows."""
+    forces = ForceEstimator(GEL, GRID)
+    pressed = slips_of(pulled, friction=None)[1]
+    assert not pressed.gross and pressed.confidence is None
+    force = forces.estimate(pulled[1].displacement_mm * 1e-3, VALID)
+    assert force is not None and force.contact and slip_text(force, pressed) == "slip unknown"
+    known = slips_of(pulled, friction=FRICTION)[1]
+    assert known.confidence is not None and slip_text(force, known).startswith("sticks ")
 
 
 def test_a_held_object_is_no_gross_slip() -> None:

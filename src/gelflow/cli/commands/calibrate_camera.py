@@ -166,7 +166,7 @@ def _visible_part(image: NDArray[np.uint8], args: argparse.Namespace, *, given: 
             f"the image shows {extent.rows} rows of {extent.cols} markers, which is no part of a grid of {args.rows} × "
             f"{args.cols}: correct --rows and --cols"
         )
-    reason = "does not tell which lines of the printed grid it shows" if parts else "does not show these lines"
+    reason = "does not show which lines of the printed grid these are" if parts else "does not show these lines"
     raise UsageError(f"the image {reason}: look at the gel, and give {', or '.join(options)}")
 
 

@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
 def _table(fit: GelFit, images: int, files: list[Path]) -> Table:
     gel, table = fit.gel, Table(show_header=False)
     table.add_row("images", f"{images} with contact and measured force, {fit.contacts} contacts")
-    low, high = (gel.youngs_modulus * (1 + 1.96 * sign * gel.youngs_modulus_deviation) for sign in (-1, 1))
+    low, high = (gel.youngs_modulus * max(0.0, 1 + 1.96 * sign * gel.youngs_modulus_deviation) for sign in (-1, 1))
     table.add_row("Young's modulus", f"{gel.youngs_modulus:.4g} Pa, 95 % interval {low:.4g} to {high:.4g}")
     table.add_row("normal forces", _factor_text(fit.normal))
     table.add_row("shear forces", _factor_text(fit.shear))

@@ -105,7 +105,7 @@ def run(args: argparse.Namespace) -> int:
         calibration, args.pixels_per_mm = _pad_scale(pad, profile)
     args.gel = None if gel is None else gel.gel
     for file in args.out:
-        if file.name.endswith(SUFFIX) and args.gel is None:
+        if file.name.lower().endswith(SUFFIX) and args.gel is None:
             raise UsageError(f"--out {file} needs the gel: give --gel FILE")
     summary, begin = TrackingSummary(), time.perf_counter()
     try:
@@ -386,10 +386,10 @@ def _show(
 
 
 def _visible_text(parts: list[VisiblePart], markers: int) -> str:
-    """The visible lines of a printed grid, or how many there are where the image does not tell which ones."""
+    """The visible lines of a printed grid, or how many there are where the image does not show which ones."""
     rows, cols = parts[0].rows, parts[0].cols
     count = f"{markers} of {rows * cols} printed markers"
     if len(parts) == 1:
         return f"{count}: {lines_text(parts[0].lines, rows, cols)}, counted in the image"
     seen_rows, seen_cols = parts[0].shape
-    return f"{count}: {seen_rows} of {rows} rows, {seen_cols} of {cols} columns; the image does not tell which ones"
+    return f"{count}: {seen_rows} of {rows} rows, {seen_cols} of {cols} columns; the image does not show which ones"
