@@ -54,7 +54,7 @@ PHASES: Mapping[Phase, PhaseRule] = MappingProxyType(
         Phase.APPROACH: PhaseRule(
             "with the part down to the start height",
             moves=True,
-            on_contact="hold, retreat; the rim is there",
+            on_contact="hold, retreat; this height becomes that of the rim",
             following=(Phase.DESCEND, Phase.RETREAT),
         ),
         Phase.DESCEND: PhaseRule(
@@ -78,7 +78,7 @@ PHASES: Mapping[Phase, PhaseRule] = MappingProxyType(
         Phase.CORRECT: PhaseRule(
             "to the corrected pose",
             moves=True,
-            on_contact="hold, retreat; the rim is there",
+            on_contact="hold, retreat; this height becomes that of the rim",
             following=(Phase.DESCEND, Phase.RETREAT),
         ),
         Phase.RELEASE: PhaseRule("the fingers open; comparison of the pads", following=(Phase.RETREAT, Phase.IDLE)),

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gelflow.errors import GelflowError
+from gelflow.errors import GelflowError, UsageError
 from gelflow.observation import FlowMap, flow_map
 from gelflow.protocols import Policy
 from gelflow.real.runner.cell import Cell, open_cell
@@ -37,7 +37,7 @@ class RunPlan:
     session: Path  # the recording, a new file
     checkpoint: Path | None = None  # of the policy, for the recording
     insertions: int = 1
-    operator: Callable[[MotionExecutor], Operator] | None = None  # None: wait for the lab file's load_wait
+    operator: Callable[[MotionExecutor], Operator] | None = None  # None: wait for the lab file's part.load_wait
     on_preflight: Callable[[list[PreflightItem]], None] = lambda items: None
     on_attempt: Callable[[int, Attempt], None] = lambda number, attempt: None
     on_insertion: Callable[[Insertion], None] = lambda insertion: None
@@ -70,7 +70,16 @@ class DryRun:
 
 
 def run_insertions(plan: RunPlan) -> list[Insertion]:
-    """Run and record the insertions of a plan. Raises the first error after which continuing is unsafe."""
+    """Run and record the insertions of a plan. Raises the first error after which continuing is unsafe.
+
+    Raises UsageError when a person presents the parts (`part.presentation` is "prompt") and the plan has no operator:
+    the fingers would close without a question.
+    """
+    if plan.operator is None and plan.lab.part.presentation == "prompt":
+        raise UsageError(
+            'part.presentation of the lab is "prompt", and the run has no operator to ask: give RunPlan an operator, '
+            'or set presentation = "wait" where a part is always present after load_wait'
+        )
     results = []
     with (
         _recording(plan, dry_run=False) as recorder,

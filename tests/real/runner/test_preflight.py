@@ -11,7 +11,7 @@ from tests.real.wsg.harness import Relay, unmodified
 
 from gelflow.cli.main import main
 from gelflow.cli.mock_lab import lab_for
-from gelflow.errors import GelflowError, PeerTimeout, SafetyError
+from gelflow.errors import GelflowError, PeerTimeout, SafetyError, UsageError
 from gelflow.hardware_mocks.robot import MockRobot
 from gelflow.real.runner.lab import Lab
 from gelflow.real.runner.lab_file import load_lab, save_lab
@@ -89,6 +89,16 @@ def test_device_that_does_not_answer_gives_a_one_line_error(
         run_insertions(RunPlan(load_lab(path), OraclePolicy(robot), INSERTION, tmp_path / "session.mcap"))
     assert expected in str(error.value) and "\n" not in str(error.value)
     assert not robot.gripper.fast_stopped
+
+
+def test_a_run_without_an_operator_is_refused_where_a_person_presents_the_parts(
+    robot: MockRobot, tmp_path: Path
+) -> None:
+    lab = lab_for(robot)
+    lab = replace(lab, part=replace(lab.part, presentation="prompt"))
+    with pytest.raises(UsageError, match="has no operator to ask"):
+        run_insertions(RunPlan(lab, OraclePolicy(robot), INSERTION, tmp_path / "session.mcap"))
+    assert not (tmp_path / "session.mcap").exists()
 
 
 def test_run_command_refuses_invalid_files_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
