@@ -63,7 +63,10 @@ def plan(words: list[str]) -> int:
     count = 2 if args.quick else args.worlds
     seeds = range(args.first, args.first + count)
     with script.progress("worlds", count) as advance:
-        result = measure_plan(seeds, motions, fits=args.fits, processes=2, progress=lambda world: advance(1))
+        settings = _QUICK if args.quick else None
+        result = measure_plan(
+            seeds, motions, settings=settings, fits=args.fits, processes=2, progress=lambda world: advance(1)
+        )
     table = Table("intervals", "worlds", "motions planned", "unplanned", "mean ratio of widths", "same or narrower")
     for key, name in (("expected", "expected"), ("expected_half", "expected, half"), ("fitted", "calibrated")):
         if key in result:

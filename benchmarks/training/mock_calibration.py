@@ -3,7 +3,7 @@
     python -m benchmarks.training.mock_calibration --worlds 20
 
 The worlds differ in gels, friction, hole, arm and crosstalk, drawn from a third of the lower limits to three times the
-upper limits of the randomization; the calibration sees the recorded session only. The same command continues a run that
+upper limits of the randomization; the calibration uses the recorded session only. The same command continues a run that
 was killed.
 """
 

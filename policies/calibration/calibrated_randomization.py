@@ -16,6 +16,7 @@ from gelflow.errors import UsageError
 from gelflow.policies.calibration.calibration import FORMAT, Calibration
 from gelflow.policies.calibration.model.parameters import gain_ratio
 from gelflow.policies.calibration.model.reading_model import ReadingModel, unit_per_newton
+from gelflow.policies.calibration.model.shear_model import QUANTITIES
 from gelflow.sim.tasks.insertion import insertion_scene
 from gelflow.sim.tasks.insertion_randomization import DEFAULT_RANDOMIZATION
 from gelflow.task import InsertionTask
@@ -23,7 +24,7 @@ from gelflow.task import InsertionTask
 Array = NDArray[np.float64]
 
 SAMPLES = 256
-_LIMIT = 3**0.5  # of whitened parameters: three times the ranges of the randomization, which the priors stand for
+_LIMIT = 3**0.5  # of a whitened parameter [sd]: three times the range of a randomization that is the prior
 _NOISE = 2.0  # factor by which the estimate of the noise may be wrong
 _DIGITS = 5  # significant
 
@@ -53,7 +54,10 @@ def _samples(result: Calibration, rng: np.random.Generator) -> dict[str, Array]:
     """
     confirmed = {e.parameter.name for e in result.estimates if e.confirmed}
     fitted = result.parameters
-    points = np.clip(result.fit.draw(rng, SAMPLES), -_LIMIT, _LIMIT)
+    points = result.fit.draw(rng, SAMPLES)
+    of_table = [p.name in QUANTITIES and not p.name.startswith("grasp") for p in fitted]
+    limit = np.where(of_table, _LIMIT, np.abs(points.mean(0)) + _LIMIT)
+    points = np.clip(points, -limit, limit)
     values = {p.name: p.value(points[:, i]) for i, p in enumerate(fitted)}
     ratio, direction = gain_ratio(fitted)
     values[ratio.name] = ratio.value(points @ direction)

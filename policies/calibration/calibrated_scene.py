@@ -45,7 +45,7 @@ def write_scene(result: Calibration, folder: Path) -> list[Path]:
 
 
 def _changed_parameters(known: Mapping[str, float]) -> dict[str, float]:
-    """Parameters of the simulator with calibrated values, in so far as these change them."""
+    """Parameters of the simulator that differ from those of the scene."""
 
     def parameters(values: Mapping[str, float]) -> dict[str, float]:
         nominal = NOMINAL.replace(**values).sample(np.random.default_rng(0), 1, friction="elastic")

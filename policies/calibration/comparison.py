@@ -54,8 +54,8 @@ def error(recorded: Array, simulated: Array, used: NDArray[np.bool_]) -> float:
 
 def noisy_markers_text(used: NDArray[np.bool_]) -> str:
     """One line about markers that are not compared; empty if all are."""
-    noisy = int((~used).sum())
-    return f"{noisy} of {len(used)} markers are too noisy and are not compared" if noisy else ""
+    left = int((~used).sum())
+    return f"{left} of {len(used)} markers are too noisy, or not in the images, and are not compared" if left else ""
 
 
 def _length(flow: Array) -> Array:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import SimulationError
+from gelflow.policies.calibration.model.parameters import FARTHEST
 from gelflow.policies.calibration.poses import INSERTED_POSE_SPREAD, draw_poses, prior_cost_of_all
 from gelflow.policies.calibration.problem import Problem
 from gelflow.policies.calibration.recordings import Recordings
@@ -22,7 +23,7 @@ Array = NDArray[np.float64]
 _ROUNDS = 20  # of one ensemble, at most
 _LATER_ROUNDS = 10
 _SPREADS = (0.5, 0.3)  # of the ensembles around the best member, relative to the prior
-_FARTHEST = 1.7  # first values of the parameters, at most [sd]
+_FIRST = 1.7  # first values of the parameters, at most [sd]
 _MODEL_ERROR = 0.04  # that residuals allow for, relative to the flow maps
 
 
@@ -53,7 +54,7 @@ def search_globally(
     """
     count, insertions = len(problem.fitted), problem.insertions
     points = rng.normal(size=(members, problem.size))
-    points[:, :count] = np.clip(points[:, :count], -_FARTHEST, _FARTHEST) if parameters is None else parameters
+    points[:, :count] = np.clip(points[:, :count], -_FIRST, _FIRST) if parameters is None else parameters
     poses = np.stack([draw_poses(problem, i, members, rng) for i in range(insertions)], axis=1)
     found = _invert(problem, points, poses, _ROUNDS, rng)
     for spread in spreads:
@@ -109,7 +110,7 @@ def _invert(
         left = left - share if share < left else 0.0
         unknowns = np.hstack([points, poses.reshape(members, -1) / scale])
         unknowns = _updated(unknowns, residuals, share, rng)
-        points = np.clip(unknowns[:, : problem.size], -4.0, 4.0)
+        points = np.clip(unknowns[:, : problem.size], -FARTHEST, FARTHEST)
         poses = (unknowns[:, problem.size :] * scale).reshape(poses.shape)
     return best
 

@@ -18,6 +18,7 @@ from threadpoolctl import threadpool_limits
 from gelflow.errors import SimulationError
 from gelflow.helper_process import worker_pool
 from gelflow.policies.calibration.ensemble import rough_problem, search_globally, search_nearby
+from gelflow.policies.calibration.model.parameters import FARTHEST
 from gelflow.policies.calibration.pose_search import better_poses
 from gelflow.policies.calibration.poses import prior_cost_of_all, refined_poses
 from gelflow.policies.calibration.problem import Problem
@@ -30,7 +31,6 @@ Array = NDArray[np.float64]
 # ensemble: the error of the model that it allows for, and its spread around the best member, relative to the prior.
 _BEFORE = ((0.04, 0.2), (MODEL_ERROR, 0.1)), 1
 _AFTER = ((MODEL_ERROR, 0.05), (MODEL_ERROR, 0.02)), 3
-_SIZES = (0.1, 0.05, 0.025, 0.012)  # spread of new poses around the best ones, see `refined_poses`
 _SUFFICIENT = 1.0  # decrease of the cost in a round below which no other follows
 _AS_GOOD = 1.3  # starts whose residuals are larger than the best ones by this factor do not count
 
@@ -201,7 +201,7 @@ def _descend(
     cost = _cost(problem, point, poses)
     for _ in range(rounds):
         before = cost
-        better, moved, found = refined_poses(problem, point, poses, rng, sizes=_SIZES, count=settings.poses)
+        better, moved, found = refined_poses(problem, point, poses, rng, count=settings.poses)
         if better < cost:
             point, poses = moved, found
         point = _levenberg_marquardt(problem, point, poses, settings.steps)
@@ -234,7 +234,7 @@ def _levenberg_marquardt(problem: Problem, point: Array, poses: Array, steps: in
         for _ in range(6):
             step = -np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
             step *= min(1.0, 1.5 / np.abs(step).max())
-            trial = np.clip(point + step, -4.0, 4.0)
+            trial = np.clip(point + step, -FARTHEST, FARTHEST)
             r_trial, ok = problem.residuals(trial, poses)
             trial_cost = problem.cost(r_trial, trial)
             if ok and trial_cost < cost:

@@ -14,7 +14,6 @@ Array = NDArray[np.float64]
 
 _EXPLAINED = 1.0  # root mean square of the whitened residuals up to which a search explains the flow maps
 _SPREADS = (0.3, 0.1, 0.03)  # of the ensembles after the first one
-_SIZES = (0.1, 0.05, 0.025, 0.012)  # of the local search
 
 
 def find_poses(
@@ -78,7 +77,7 @@ def _search(
             start = search_globally(rough, members, rng, parameters=parameters, spreads=_SPREADS)
         except SimulationError:
             return best
-        cost, *found = refined_poses(problem, *start, rng, sizes=_SIZES, count=count)
+        cost, *found = refined_poses(problem, *start, rng, count=count)
         if cost < lowest:
             lowest, best = cost, (found[0], found[1])
         if problem.errors.chi(problem.residuals(*best)[0]) <= _EXPLAINED:

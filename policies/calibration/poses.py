@@ -1,7 +1,5 @@
 """Priors of the misalignment of each insertion, and a local search: random poses, compared with the flow maps."""
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,6 +10,7 @@ Array = NDArray[np.float64]
 
 # Standard deviation of the pose of an inserted part in its hole [m, m, rad].
 INSERTED_POSE_SPREAD = np.array([1.3e-3, 1.3e-3, np.radians(2.5)])
+_SIZES = (0.1, 0.05, 0.025, 0.012)  # spreads of new poses around the best ones / `INSERTED_POSE_SPREAD`, by round
 _HEIGHTS = np.array([-1.5, -0.75, 0.0, 0.75, 1.5])  # start heights that are tried, in standard deviations
 _SHORTLIST = 6
 _PARENTS = 3  # best poses, around which new ones are drawn
@@ -152,16 +151,16 @@ def _with_heights(
 
 
 def refined_poses(
-    problem: Problem, point: Array, poses: Array, rng: np.random.Generator, *, sizes: Sequence[float], count: int
+    problem: Problem, point: Array, poses: Array, rng: np.random.Generator, *, count: int
 ) -> tuple[float, Array, Array]:
     """Random search of the poses (insertions, 3) and start heights with fixed parameters.
 
-    Each round draws `count` poses of each insertion around the best ones so far; `sizes` are the spreads of the rounds,
-    relative to `INSERTED_POSE_SPREAD`. Returns the cost, the point with the start heights, and the poses.
+    Each round draws `count` poses of each insertion around the best ones so far, closer to them from round to round.
+    Returns the cost, the point with the start heights, and the poses.
     """
     parameters, best = point[: len(problem.fitted)], [pose[None] for pose in poses]
     costs: list[Array] = []
-    for size in sizes:
+    for size in _SIZES:
         candidates = []
         for present in best:
             parents = present[rng.integers(0, min(_PARENTS, len(present)), count)]

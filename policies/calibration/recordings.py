@@ -45,6 +45,7 @@ class Recordings:
     planned: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
     # Markers that are compared, (pads * rows * cols,); empty: those that are not noisy.
     used: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    given_noise: float | None = None  # result of `noise`; None: it is estimated
 
     def __post_init__(self) -> None:
         if not len(self.planned):
@@ -56,7 +57,7 @@ class Recordings:
         return len(self.insertion)
 
     def of(self, insertions: NDArray[np.int64]) -> "Recordings":
-        """The attempts of some insertions, counted from 0 again."""
+        """The attempts of some insertions, counted from 0 again, with the noise of all: few maps determine it badly."""
         rows = np.isin(self.insertion, insertions)
         number = {int(old): new for new, old in enumerate(np.unique(self.insertion[rows]))}
         return dataclasses.replace(
@@ -67,6 +68,7 @@ class Recordings:
             flow=self.flow[rows],
             planned=self.planned[rows],
             names=tuple(name for name, row in zip(self.names, rows, strict=True) if row),
+            given_noise=self.noise(),
             inserted={number[i]: pose for i, pose in self.inserted.items() if i in number},
         )
 
@@ -77,6 +79,8 @@ class Recordings:
         over the markers of a pad ignores the edges of contacts; the lower quartile over attempts and pads ignores the
         maps of firm contacts, which are not smooth.
         """
+        if self.given_noise is not None:
+            return self.given_noise
         of_pads = np.median(np.abs(_second_differences(self.flow)).reshape(math.prod(self.flow.shape[:2]), -1), axis=1)
         return float(np.quantile(of_pads, 0.25) / _MEDIAN_SIZE / self._roughness())
 

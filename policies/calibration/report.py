@@ -144,21 +144,21 @@ def error_lines(result: Calibration) -> list[str]:
     if not result.height_plausible:
         lines.append(
             f"in the fit the attempts start {abs(1e3 * result.height_offset):.1f} mm "
-            f"{'higher' if result.height_offset > 0 else 'lower'} than by the lab file: check the taught height of the "
-            "hole and part.grasp_height, since stiffnesses depend on them"
+            f"{'higher' if result.height_offset > 0 else 'lower'} than the runner assumed: check the taught height of "
+            "the hole and part.grasp_height, since stiffnesses depend on them"
         )
     if not result.reproduced:
         lines.append(
             f"the fit does not reproduce the recordings: its residual is {result.fit.best.chi:.1f} times that expected "
             "from noise and model; no parameter counts as known, and the intervals are not reliable"
         )
-    elif not result.converged:
+    if not result.converged:
         used = len(result.fit.starts)
         lines.append(
             f"{used} of {used + result.fit.others} searches found this fit, the others worse ones: another could be "
             "better still, and no parameter counts as known; record more attempts, or try another --seed"
         )
-    elif result.predicted is False:
+    if result.predicted is False:
         lines.append(
             "the calibration does not predict the held-out insertion: its residual is "
             f"{result.held_out_residual:.1f} times that expected from noise and model; no stiffness, friction or grasp "

@@ -1,34 +1,47 @@
 """Recordings for a calibration, from the sessions of the insertion runner."""
 
+import dataclasses
 import filecmp
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
-from gelflow.observation import Grid
+from gelflow.observation import Grid, resampling_weights
+from gelflow.part import Part
 from gelflow.policies.calibration.recordings import Recordings
 from gelflow.session.reader import SessionReader
 from gelflow.session.records import Decision
+from gelflow.sim.tasks.parts import with_shipped_mesh
 from gelflow.task import InsertionTask
 
 AT_REST = 0.05  # time that a simulated descent rests before the reading: a robot descends ten times more slowly [s]
 _HEIGHT = 0.3e-3  # standard deviation of a part's height in the gripper, per attempt [m]
 
 
-def read_recordings(paths: Sequence[Path]) -> Recordings:
+def read_recordings(
+    paths: Sequence[Path],
+    *,
+    part: Part | None = None,
+    visible_markers: Callable[[Mapping[str, Any]], Sequence[NDArray[np.bool_]]] | None = None,
+) -> Recordings:
     """Attempts with contact of one or several sessions of one task.
 
-    Insertions are numbered over all sessions. Raises UsageError when a session is given twice or is of another part or
-    set-up (printed markers, cameras, grasp), its flow maps are not in millimetres, or there is no attempt with contact.
+    Insertions are numbered over all sessions. `part` is the part of the sessions with the files of its meshes, which a
+    session does not contain. `visible_markers` gives, from the description of a session, which printed markers of each
+    pad its camera shows; the others, which the runner interpolates, are not compared. Raises UsageError when a session
+    is given twice or is of another part or set-up (printed markers, cameras, grasp), a value is not finite, its flow
+    maps are not in millimetres, or there is no attempt with contact.
     """
     rows: list[dict[str, Any]] = []
     inserted: dict[int, np.ndarray[Any, Any]] = {}
     setup: _Setup | None = None
     planned: list[bool] = []  # only a session of planned motions names no policy
+    visible: Sequence[NDArray[np.bool_]] = ()
     number = 0
     for k, path in enumerate(paths):
         with SessionReader(path) as session:
@@ -36,7 +49,9 @@ def read_recordings(paths: Sequence[Path]) -> Recordings:
                 if filecmp.cmp(path, other, shallow=False):  # a copy of a fitted insertion would be held out
                     raise UsageError(f"{path}: the same session as {other}; name it once")
             described = session.description()
-            present = _Setup.of(path, described)
+            present = _Setup.of(path, described, part)
+            if setup is None and visible_markers is not None:
+                visible = visible_markers(described)
             setup = setup or present
             present.check(path, setup, paths[0])
             found, entered = _attempts(path, session, number)
@@ -51,7 +66,7 @@ def read_recordings(paths: Sequence[Path]) -> Recordings:
         )
     keep = sorted({row["insertion"] for row in rows})
     new = {old: k for k, old in enumerate(keep)}
-    return Recordings(
+    recordings = Recordings(
         setup.task,
         np.array([new[row["insertion"]] for row in rows], dtype=np.int64),
         np.array([row["planar_pose"] for row in rows], dtype=float),
@@ -67,6 +82,16 @@ def read_recordings(paths: Sequence[Path]) -> Recordings:
         planned=np.array(planned),
         height_spread=_HEIGHT,
     )
+    return dataclasses.replace(recordings, used=recordings.used & _measured(recordings, visible))
+
+
+def _measured(recordings: Recordings, visible: Sequence[NDArray[np.bool_]]) -> NDArray[np.bool_]:
+    """Markers of the flow maps whose values come from visible printed markers only, (pads * rows * cols,)."""
+    if not visible:
+        return np.ones_like(recordings.used)
+    grid = recordings.task.grid
+    weights = resampling_weights((recordings.printed or grid).positions(), grid)
+    return np.concatenate([~(np.abs(weights[:, ~shown]) > 1e-9).any(1) for shown in visible])
 
 
 def nothing_recorded(
@@ -98,20 +123,20 @@ class _Setup:
     grasp_height: float  # of the pad centres above the part's centre [m]
 
     @classmethod
-    def of(cls, path: Path, described: dict[str, Any]) -> "_Setup":
+    def of(cls, path: Path, described: dict[str, Any], part: Part | None) -> "_Setup":
         """The set-up in the description of a session. Raises UsageError for another task, and without a grasp."""
-        task = _task(path, described)
+        task = _task(path, described, part)
         try:
             mounts = described["mounts"]
             lab = described["lab"]
             force = float(lab["gripper"]["grasp_force"])
             height = float(lab["part"]["grasp_height"]) - task.part.size[2] / 2
-        except (KeyError, TypeError):
+            one = mounts[0]
+            printed = Grid(one["rows"], one["cols"], one["pitch"], tuple(one["center"])) if "pitch" in one else None
+        except (KeyError, IndexError, TypeError, ValueError):
             raise UsageError(
                 f"{path}: the session has no camera mounts, or no lab file with grasp_force and grasp_height"
             ) from None
-        one = mounts[0]
-        printed = Grid(one["rows"], one["cols"], one["pitch"], tuple(one["center"])) if "pitch" in one else None
         return cls(task, printed, mounts, force, height)
 
     def check(self, path: Path, first: "_Setup", of_first: Path) -> None:
@@ -133,12 +158,23 @@ class _Setup:
                 raise UsageError(f"{path}: {text}; calibrate it alone")
 
 
-def _task(path: Path, described: dict[str, Any]) -> InsertionTask:
+def _task(path: Path, described: dict[str, Any], part: Part | None) -> InsertionTask:
+    """The task of a session, with the files of the meshes of `part`, or of one that comes with gelflow."""
     data = described.get("task")
     if not isinstance(data, dict) or data.get("name") != "insertion":
         name = data.get("name") if isinstance(data, dict) else data
         raise UsageError(f"{path}: a calibration needs a session of the task insertion, got {name!r}")
-    return InsertionTask.from_json(dict(data))
+    task = InsertionTask.from_json(dict(data))
+    if part is None:
+        part = with_shipped_mesh(task.part)
+        for name, digest, file in (("part", part.mesh, part.mesh_file), ("hole", part.hole_mesh, part.hole_file)):
+            if digest and not file:
+                raise UsageError(
+                    f"{path}: the {name} is a mesh, which a session does not contain; add --part PART.toml"
+                )
+    elif part != task.part:
+        raise UsageError(f"{path}: the session has another part than --part; leave --part out, or give its part file")
+    return dataclasses.replace(task, part=part)
 
 
 def _attempts(
@@ -164,15 +200,10 @@ def _attempts(
                 f"{path}: flow maps are in {decision.unit!r}, expected mm; give the cameras of the lab file a scale"
             )
         depth = decision.depths[-1] - decision.depths[0] if decision.depths else float(value["depth"])
-        rows.append(
-            {
-                "insertion": insertion,
-                "name": f"insertion {insertion}, attempt {decision.attempt}",
-                "planar_pose": planar,
-                "depth": depth,
-                "flow": _vectors(decision),
-            }
-        )
+        name, flow = f"insertion {insertion}, attempt {decision.attempt}", _vectors(decision)
+        if not (np.isfinite(planar).all() and np.isfinite(depth) and np.isfinite(flow).all()):
+            raise UsageError(f"{path}: {name} contains values that are not finite")
+        rows.append({"insertion": insertion, "name": name, "planar_pose": planar, "depth": depth, "flow": flow})
     return rows, inserted
 
 

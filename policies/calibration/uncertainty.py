@@ -9,6 +9,7 @@ the cost has risen as a normal distribution predicts (a likelihood-ratio interva
 import numpy as np
 from numpy.typing import NDArray
 
+from gelflow.policies.calibration.model.parameters import FARTHEST
 from gelflow.policies.calibration.poses import prior_cost_of_all, prior_information
 from gelflow.policies.calibration.problem import POSE_STEP, Problem
 
@@ -16,7 +17,6 @@ Array = NDArray[np.float64]
 
 _DEVIATIONS = 1.96  # at which the rise of the cost is measured
 _FACTORS = np.array([1.0, 2.0, 4.0, 8.0, 16.0])  # of a deviation that are tried, until the rise is sufficient
-_LIMIT = 4.0  # whitened parameters and heights stay within, as in the fit
 
 
 def covariance(problem: Problem, point: Array, poses: Array, chi: float) -> Array:
@@ -47,12 +47,15 @@ def _gauss_newton(problem: Problem, point: Array, poses: Array, scale: float) ->
 
 
 def _pose_columns(problem: Problem, point: Array, poses: Array) -> Array:
-    """Changes of the whitened residuals per `POSE_STEP` of each insertion's pose, (n, 2 * markers, 3 * insertions)."""
+    """Changes of the whitened residuals per `POSE_STEP` of each insertion's pose, (n, 2 * markers, 3 * insertions).
+
+    Zero where a simulation fails: the prior of the pose then counts alone.
+    """
     n, rows = len(problem.recordings), np.arange(len(problem.recordings))
     result = np.zeros((n, 2 * problem.errors.markers, 3 * len(poses)))
     for axis in range(3):
         sides = [_residuals(problem, point[None], (poses + s * np.diag(POSE_STEP)[axis])[None])[0] for s in (1, -1)]
-        result[rows, :, 3 * problem.recordings.insertion + axis] = (sides[0] - sides[1]) / 2
+        result[rows, :, 3 * problem.recordings.insertion + axis] = np.nan_to_num((sides[0] - sides[1]) / 2)
     return result
 
 
@@ -80,9 +83,9 @@ def _factors(problem: Problem, point: Array, poses: Array, axes: Array, scale: f
         open_ = np.arange(count)
         for factor in _FACTORS:
             moved = sign * factor * _DEVIATIONS * axes[:, open_].T
-            points = np.clip(point + moved[:, :size], -_LIMIT, _LIMIT)
-            placed = poses + moved[:, size:].reshape(len(open_), -1, 3) * POSE_STEP
-            risen = _costs(problem, points, placed, scale) - base >= 0.5 * _DEVIATIONS**2
+            points = np.clip(point + moved[:, :size], -FARTHEST, FARTHEST)
+            other = poses + moved[:, size:].reshape(len(open_), -1, 3) * POSE_STEP
+            risen = _costs(problem, points, other, scale) - base >= 0.5 * _DEVIATIONS**2
             factors[side, open_[risen]] = factor
             open_ = open_[~risen]
             if not len(open_):

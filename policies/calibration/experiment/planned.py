@@ -12,9 +12,7 @@ from gelflow.policies.calibration.calibration import calibrate
 from gelflow.policies.calibration.experiment.worlds import RecordedWorld, record_world
 from gelflow.policies.calibration.fit import FitSettings
 from gelflow.policies.calibration.model.reading_model import ReadingModel
-from gelflow.policies.calibration.model.shear_model import Descents
-from gelflow.policies.calibration.planning.information import information, pose_prior, without_pose
-from gelflow.policies.calibration.problem import in_hole
+from gelflow.policies.calibration.planning.information import Attempts, information, pose_prior, without_pose
 from gelflow.policies.calibration.session_recordings import AT_REST
 from gelflow.session.motion_plan import PlannedMotion
 
@@ -97,9 +95,9 @@ def expected_widths(world: RecordedWorld, *, attempts: int | None = None) -> dic
     recordings = dataclasses.replace(world.recordings, settle=AT_REST)
     readings = ReadingModel(recordings)
     point = np.array([float(p.whitened(np.array(world.truth[p.name]))) for p in readings.fitted])
-    pose = in_hole(world.misalignment[recordings.insertion], recordings.planar_pose)
-    descents = Descents(pose, world.heights, recordings.depth)
-    each = information(readings, point, descents, recordings.noise() / readings.scale)
+    misalignment = world.misalignment[recordings.insertion]
+    attempts_made = Attempts(misalignment, recordings.planar_pose, world.heights, recordings.depth)
+    each = information(readings, point, attempts_made, recordings.noise() / readings.scale)
     total = np.eye(len(readings.fitted))
     for insertion in np.unique(recordings.insertion):
         of_part = each[recordings.insertion == insertion][:attempts].sum(0)

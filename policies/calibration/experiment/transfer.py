@@ -1,6 +1,6 @@
 """The transfer matrix: worlds that differ from training in one thing, with the shipped policy, then fine-tuned.
 
-Worlds are simulated, so that hundreds of insertions take seconds; the policy and the calibration do not see them.
+Worlds are simulated, so that hundreds of insertions take seconds; policy and calibration do not use their values.
 """
 
 import dataclasses
@@ -104,7 +104,7 @@ def measure_world(
 ) -> dict[str, Any]:
     """One row: success of the shipped policy, and after calibration and fine-tuning where it is lower than `below`.
 
-    The calibration sees five insertions of the shipped policy; the fine-tuning, in `folder`, draws from the
+    The calibration uses five insertions of the shipped policy; the fine-tuning, in `folder`, draws from the
     randomization that it has narrowed. Both know the true part and hole, as from a part file. `attempts` is the length
     of the fine-tuning, by default that of the recipe.
     """

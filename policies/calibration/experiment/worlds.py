@@ -1,4 +1,4 @@
-"""Random worlds with known truth, and insertions recorded in them by the simulation without wires."""
+"""Random worlds with known truth, and insertions recorded in them by the simulated training environment."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 # 3e-3, three times the limit of the randomization.
 DRIFT = 3e-3 * math.sqrt(2 / 3)  # until a fit estimates it
 _LARGEST_DRIFT = 3e-3 * math.sqrt(2)
-_CORRELATED = 9.0  # neighbouring markers that share the error of the model
+_CLUSTER = 9.0  # neighbouring markers that share the error of the model
 _LEAST_VARIANCE = 1e-12  # of a marker [N²], where a flow map is zero
 _HUBER = 3.0  # residuals beyond this many standard deviations count linearly
 
@@ -51,8 +51,8 @@ class ErrorModel:
 
     @cached_property
     def cluster_size(self) -> Array:
-        """How many neighbouring markers count as one, (n,): 1 with noise only, `_CORRELATED` without noise."""
-        return np.asarray((self.noise**2 + _CORRELATED * (self._of_model + _LEAST_VARIANCE)) / self._variance)
+        """How many neighbouring markers count as one, (n,): 1 with noise only, `_CLUSTER` without noise."""
+        return np.asarray((self.noise**2 + _CLUSTER * (self._of_model + _LEAST_VARIANCE)) / self._variance)
 
     @property
     def num_independent(self) -> Array:
@@ -99,7 +99,7 @@ class ErrorModel:
     def estimated_drift(self, difference: Array) -> float:
         """`drift` from the differences (n, all markers, 2) [N] at the end of a fit, at most `_LARGEST_DRIFT`.
 
-        The fit takes up part of the shifts: their squares count twice.
+        The fit absorbs part of the shifts, so the variance is doubled.
         """
         mean = self._mean(difference.reshape(len(difference), 2, -1, 2))
         return min(_LARGEST_DRIFT, float(np.sqrt(2 * (mean**2).mean())))

@@ -25,6 +25,7 @@ _SENSOR = (  # name, unit, meaning, logarithmic, centre, standard deviation
 )
 _GEL_GAIN = 1.5  # standard deviation of the logarithm of a pad's gain [mm/N], whose gel is not that of the scene
 COMMANDED_FORCE = 0.1  # relative standard deviation of the grasp force around the commanded one
+FARTHEST = 4.0  # largest whitened parameter or start height of a fit
 TAUGHT_HEIGHT = 2e-3  # standard deviation of the grasp height around that of the lab file [m]
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import SimulationError, UsageError
-from gelflow.geometry import apply_planar, rotated, rotation_matrices, yaw_quaternion
+from gelflow.geometry import apply_planar, rotated, rotation_matrices, turned_about_z
 from gelflow.sim import _core
 from gelflow.sim.simulator import STATUS_MESSAGES, Simulator
 from gelflow.sim.tasks.gripper.pads import NOMINAL_PAD_VALUES
@@ -34,7 +34,7 @@ _WITHOUT_GRASP = ("hole_kn", "hole_mu")  # have no effect on the grasp at rest
 POSE = ("x", "y", "yaw", "z")  # directions of the pose of a descent, after `QUANTITIES`
 _ITERATION_LIMIT = 80  # of Newton's method in a step of a rough simulation
 _BATCH = 64  # descents that are simulated at once
-_SIZES = 8  # numbers of descents for which a simulator is kept
+_KEPT = 8  # numbers of descents for which a simulator is kept
 _FINGERS = (("finger_left", "pad_left"), ("finger_right", "pad_right"))
 
 
@@ -100,7 +100,7 @@ class ShearModel:
 
     def _sim(self, count: int) -> Simulator:
         if count not in self._sims:
-            if len(self._sims) >= _SIZES:
+            if len(self._sims) >= _KEPT:
                 self._sims.clear()
             self._sims[count] = Simulator(self.scene, num_envs=count, threads=self._threads)
         return self._sims[count]
@@ -213,8 +213,7 @@ class ShearModel:
         q[:, self._arm_q] = np.column_stack([x, y, q[:, self._arm_q[2]] + lift, yaw])
         q[:, at : at + 2] = apply_planar(descents.pose, part[:, :2])
         q[:, at + 2] += lift
-        turn = np.stack([yaw_quaternion(angle) for angle in yaw])
-        q[:, at + 3 : at + 7] = _product(turn, part[:, 3:])
+        q[:, at + 3 : at + 7] = turned_about_z(part[:, 3:], yaw)
         u[:, self._arm_u] = np.column_stack([x, y, u[:, self._arm_u[2]] + lift, yaw])
         return q, u
 
@@ -270,7 +269,7 @@ class ShearModel:
         u[:count, z] -= depth * np.arange(1, count + 1) / count
         u[count:, z] -= depth
         start = (grasp.params, q[0], grasp.anchors, u, anchored)
-        tangents = [self._placed(sim, name, tangent, q[0], descent) for name, tangent in settled.items()]
+        tangents = [self._tangent_at_start(sim, name, tangent, q[0], descent) for name, tangent in settled.items()]
         end = self._dual(sim, start, tangents)
         slopes = np.stack([_shear(derivative.tactile) for derivative in end.derivatives])
         return _shear(end.end.tactile) - grasp.shear, slopes - np.stack([one.shear for one in settled.values()])
@@ -317,7 +316,7 @@ class ShearModel:
             u[scene.u(finger)] = float(name == "grasp_force")
         return _Grasp(q, zero.anchors, u, direction, zero.shear)
 
-    def _placed(self, sim: Simulator, name: str, settled: _Grasp, start: Array, descent: Descents) -> _Grasp:
+    def _tangent_at_start(self, sim: Simulator, name: str, settled: _Grasp, start: Array, descent: Descents) -> _Grasp:
         """Derivative of the start of a descent, from that of the grasp at rest and of the pose."""
         q, u, at = settled.q.copy(), settled.u.copy(), sim.joint_v("part")
         x, y, yaw = descent.pose[0]
@@ -378,9 +377,3 @@ def _points_in_contact(gaps: Array, force: float, stiffness: float) -> float:
     """1 / number of the springs in contact, see `indentation`."""
     count = np.arange(1, len(gaps) + 1)
     return 1.0 / float(count[np.argmin((force + stiffness * np.cumsum(gaps)) / (stiffness * count))])
-
-
-def _product(a: Array, b: Array) -> Array:
-    """Products of quaternions w x y z, (n, 4)."""
-    w, v, w2, v2 = a[:, :1], a[:, 1:], b[:, :1], b[:, 1:]
-    return np.hstack([w * w2 - (v * v2).sum(1, keepdims=True), w * v2 + w2 * v + np.cross(v, v2)])

@@ -1,5 +1,7 @@
 """Fisher information of attempts that are not recorded yet."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -7,7 +9,7 @@ from gelflow.errors import SimulationError
 from gelflow.policies.calibration.model.error_model import DRIFT, ErrorModel
 from gelflow.policies.calibration.model.reading_model import ReadingModel
 from gelflow.policies.calibration.model.shear_model import QUANTITIES, Descents
-from gelflow.policies.calibration.problem import POSE_STEP
+from gelflow.policies.calibration.problem import POSE_STEP, in_hole
 from gelflow.task import InsertionTask
 
 Array = NDArray[np.float64]
@@ -15,15 +17,29 @@ Array = NDArray[np.float64]
 _STEP = 0.2  # of differences in parameters and start heights, in standard deviations of their priors
 
 
-def information(readings: ReadingModel, point: Array, descents: Descents, noise: float, drift: float = DRIFT) -> Array:
-    """Fisher information of each of n descents about the whitened parameters and its pose, (n, count + 3, count + 3).
+@dataclass(frozen=True)
+class Attempts:
+    """n attempts, as in `Recordings`."""
 
-    The pose is in units of `POSE_STEP`; the start height of each descent is unknown. `noise` is the standard deviation
-    of the difference of two readings of a marker [N], `drift` that of a common shift of a pad [N]. Slopes are
-    differences of simulated readings, which are faster than exact derivatives for many descents. Raises SimulationError
-    when no descent can be simulated.
+    misalignment: Array  # of the part on which each is made (n, 3)
+    planar_pose: Array  # of the gripper in the taught frame of the hole (n, 3)
+    z: Array  # start heights above the nominal one (n,) [m]
+    depth: Array  # (n,) [m]
+
+    def descents(self, shift: Array | float = 0.0) -> Descents:
+        """The descents, with `shift` added to all misalignments."""
+        return Descents(in_hole(self.misalignment + shift, self.planar_pose), self.z, self.depth)
+
+
+def information(readings: ReadingModel, point: Array, attempts: Attempts, noise: float, drift: float = DRIFT) -> Array:
+    """Fisher information of each of n attempts about the whitened parameters and its misalignment.
+
+    Shape (n, count + 3, count + 3), with the misalignment in units of `POSE_STEP`; the start height of each attempt is
+    unknown. `noise` is the standard deviation of the difference of two readings of a marker [N], `drift` that of a
+    common shift of a pad [N]. Slopes are differences of simulated readings, which are faster than exact derivatives for
+    many descents. Raises SimulationError when no descent can be simulated.
     """
-    reading, columns, ok = _slopes(readings, point, descents)
+    reading, columns, ok = _slopes(readings, point, attempts)
     if not ok.any():
         raise SimulationError("no descent can be simulated with these parameters")
     errors = ErrorModel(noise, np.sqrt((reading**2).mean((1, 2))), np.ones(reading.shape[1], dtype=bool), drift=drift)
@@ -36,25 +52,25 @@ def information(readings: ReadingModel, point: Array, descents: Descents, noise:
     return np.where(ok[:, None, None], result, 0.0)
 
 
-def _slopes(readings: ReadingModel, point: Array, descents: Descents) -> tuple[Array, Array, NDArray[np.bool_]]:
+def _slopes(readings: ReadingModel, point: Array, attempts: Attempts) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Readings (n, markers, 2) [N]; their slopes (n, markers, 2, count + 4); and whether all simulations succeeded.
 
-    Slopes are by each whitened parameter, by the pose in units of `POSE_STEP`, and by the start height in standard
-    deviations. Those by parameters of the pads are exact.
+    Slopes are by each whitened parameter, by the misalignment in units of `POSE_STEP`, and by the start height in
+    standard deviations. Those by parameters of the pads are exact.
     """
-    n, count = len(descents.depth), len(readings.fitted)
+    n, count = len(attempts.depth), len(readings.fitted)
     simulated = [i for i, p in enumerate(readings.fitted) if p.name in QUANTITIES]
-    # One variation of all descents after the other: none, parameters, height, poses.
+    # One variation of all descents after the other: none, parameters, height, misalignments.
     points = [point[:count] + _STEP * np.eye(count)[i] for i in simulated]
     points = [point[:count], *points, *([point[:count]] * 7)]
     shifts = [np.zeros(3)] * (len(simulated) + 2) + [s * row for row in np.diag(POSE_STEP) for s in (1.0, -1.0)]
     raised = np.zeros(len(points))
     raised[len(simulated) + 1] = _STEP * readings.height_spread
     values = {name: np.repeat(value, n) for name, value in readings.values(np.stack(points)).items()}
-    pose = (np.stack(shifts)[:, None] + descents.pose[None]).reshape(-1, 3)
-    z = np.repeat(raised, n) + np.tile(descents.z, len(points))
+    pose = np.concatenate([attempts.descents(shift).pose for shift in shifts])
+    z = np.repeat(raised, n) + np.tile(attempts.z, len(points))
     forces = {name: values[name] for name in QUANTITIES}
-    shear, ok = readings.forces.shear(forces, Descents(pose, z, np.tile(descents.depth, len(points))))
+    shear, ok = readings.forces.shear(forces, Descents(pose, z, np.tile(attempts.depth, len(points))))
     read = readings.pads.read(shear, values).reshape(len(points), n, *shear.shape[1:])
     columns = np.zeros((n, *read.shape[2:], count + 4))
     for k, i in enumerate(simulated):

@@ -2,14 +2,15 @@
 
 The hole's pose and the parameters are not known when a plan is made. The information of an attempt is therefore
 averaged over scenarios: parameters from the prior, or from a fit with its uncertainty, and misalignments from the task.
-An attempt whose part falls into the hole in a scenario has no information there. All attempts are made on one part, so
+An attempt that ends without contact in a scenario, such as one whose part enters the hole, has no information there: it
+is not calibrated. All attempts are made on one part, so
 that they share one misalignment.
 """
 
 import contextlib
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +20,7 @@ from gelflow.policies.calibration.fit import FitResult
 from gelflow.policies.calibration.model.error_model import DRIFT
 from gelflow.policies.calibration.model.reading_model import ReadingModel, displacement_scale
 from gelflow.policies.calibration.model.shear_model import Descents
-from gelflow.policies.calibration.planning.information import information, pose_prior, without_pose
-from gelflow.policies.calibration.problem import in_hole
+from gelflow.policies.calibration.planning.information import Attempts, information, pose_prior, without_pose
 from gelflow.policies.calibration.recordings import Recordings
 from gelflow.session.motion_plan import PlannedMotion
 from gelflow.task import InsertionTask
@@ -33,6 +33,7 @@ USUAL_NOISE = 1.5e-4  # of the difference of two readings of a marker, before an
 _OFFSETS = (3e-3, 6e-3, 9e-3)  # of the candidates from the taught hole [m]
 _YAWS = np.radians([-8.0, 0.0, 8.0])
 STOP_SHEAR_MM = 0.25  # mean shear along the finger at which contact stops a planned descent in an unknown lab
+_CONTACT_SHEAR_MM = 0.04  # mean shear that counts as contact at the end of a descent, as in a lab file
 _LEVELS = 8  # depths at which the stop is searched, a constant ratio apart
 _FIRST_LEVEL = 0.44e-3  # [m] below the start of an attempt, shortly before the rim
 _SPREAD = 0.7  # of the scenarios' parameters, relative to the prior
@@ -73,31 +74,32 @@ def plan_motions(
     """
     readings = ReadingModel(recordings)
     task, rng = recordings.task, np.random.default_rng((seed, 0x9A2))
-    candidates = _candidates(task, workspace)
+    poses = candidates(task, workspace)
     noise = recordings.noise() / readings.scale if len(recordings) else USUAL_NOISE
     drift = DRIFT if fitted is None else fitted.best.drift
-    stop_shear = stop_shear_mm / displacement_scale(readings.forces.scene)
+    per_newton = displacement_scale(readings.forces.scene)
     found = []
     for k in range(scenarios):
         point = _point(len(readings.fitted), fitted, rng)
         misalignment = task.draw_misalignment(rng, 1)[0]
         with contextlib.suppress(SimulationError):  # a gripper that cannot hold the part
-            poses = in_hole(misalignment, candidates)
-            depths = _stops(readings, point, poses, stop_shear)
-            found.append(information(readings, point, Descents(poses, np.zeros(len(poses)), depths), noise, drift))
+            attempts = Attempts(np.tile(misalignment, (len(poses), 1)), poses, np.zeros(len(poses)), np.zeros(0))
+            depths, shear = _stops(readings, point, attempts, stop_shear_mm / per_newton)
+            each = information(readings, point, replace(attempts, depth=depths), noise, drift)
+            found.append(np.where((shear > _CONTACT_SHEAR_MM / per_newton)[:, None, None], each, 0.0))
         progress(k + 1)
     if not found:
         raise SimulationError("no plan: the attempts cannot be simulated with the parameters of any scenario")
     before: Array = np.eye(len(readings.fitted)) if fitted is None else np.asarray(np.linalg.inv(fitted.covariance))
     chosen, gains, after = _greedy(np.stack(found), before, pose_prior(task), count)
-    motions = tuple(PlannedMotion(x, y, yaw, task.descent, stop_shear_mm) for x, y, yaw in candidates[chosen].tolist())
+    motions = tuple(PlannedMotion(x, y, yaw, task.descent, stop_shear_mm) for x, y, yaw in poses[chosen].tolist())
     names = [p.name for p in readings.fitted]
     widths = (np.sqrt(np.diag(np.linalg.inv(before))), after)
     return Plan(motions, gains, {name: (float(a), float(b)) for name, a, b in zip(names, *widths, strict=True)})
 
 
-def _candidates(task: InsertionTask, workspace: tuple[float, float, float] | None) -> Array:
-    """Planar poses (n, 3) about the taught hole within the workspace."""
+def candidates(task: InsertionTask, workspace: tuple[float, float, float] | None) -> Array:
+    """Planar poses (n, 3) about the taught hole within the workspace. Raises UsageError when there is none."""
     limit = np.minimum(task.workspace, task.workspace if workspace is None else workspace)
     directions = np.arange(8) * np.pi / 4
     poses = np.array(
@@ -123,16 +125,17 @@ def _point(count: int, fitted: FitResult | None, rng: np.random.Generator) -> Ar
     return np.asarray(start.point[:count] + np.linalg.cholesky(fitted.covariance) @ np.clip(drawn, -1.7, 1.7))
 
 
-def _stops(readings: ReadingModel, point: Array, poses: Array, stop_shear: float) -> Array:
-    """Depths (n,) [m] at which a mean shear of `stop_shear` [N] stops attempts at poses (n, 3) in the hole frame."""
-    n, task = len(poses), readings.forces.task
+def _stops(readings: ReadingModel, point: Array, attempts: Attempts, stop_shear: float) -> tuple[Array, Array]:
+    """Depths (n,) [m] at which a mean shear of `stop_shear` [N] stops the attempts, and the shear there (n,) [N]."""
+    n, task = len(attempts.planar_pose), readings.forces.task
     depths = np.geomspace(_FIRST_LEVEL, task.descent, _LEVELS)
     values = {name: np.full(n * _LEVELS, value) for name, value in readings.values(point).items()}
-    descents = Descents(np.repeat(poses, _LEVELS, 0), np.zeros(n * _LEVELS), np.tile(depths, n))
-    reading, _ = readings.read(values, descents)
+    pose = np.repeat(attempts.descents().pose, _LEVELS, 0)
+    reading, _ = readings.read(values, Descents(pose, np.zeros(n * _LEVELS), np.tile(depths, n)))
     shear = np.abs(reading.reshape(n, _LEVELS, 2, -1, 2)[..., 0].mean(3)).max(2)
-    shear[:, -1] = np.inf
-    return np.asarray(depths[(shear > stop_shear).argmax(1)])
+    stopped = shear > stop_shear
+    level = np.where(stopped.any(1), stopped.argmax(1), _LEVELS - 1)
+    return np.asarray(depths[level]), np.asarray(shear[np.arange(n), level])
 
 
 def _greedy(found: Array, before: Array, pose: Array, count: int) -> tuple[list[int], tuple[float, ...], Array]:

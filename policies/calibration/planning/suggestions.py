@@ -7,8 +7,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import SimulationError
 from gelflow.policies.calibration.fit import FitResult
-from gelflow.policies.calibration.model.shear_model import Descents
-from gelflow.policies.calibration.planning.information import information, pose_prior, without_pose
+from gelflow.policies.calibration.planning.information import Attempts, information, pose_prior, without_pose
 from gelflow.policies.calibration.problem import Problem
 
 Array = NDArray[np.float64]
@@ -45,9 +44,9 @@ def suggest(problem: Problem, result: FitResult, count: int = 3) -> list[Suggest
     for text, pose, deeper in _CANDIDATES:
         depth = _DEPTH + deeper
         try:
-            descents = Descents(np.array([pose]), np.zeros(1), np.array([depth]))
+            attempt = Attempts(np.zeros((1, 3)), np.array([pose]), np.zeros(1), np.array([depth]))
             noise, drift = problem.errors.noise, result.best.drift
-            added = information(problem.readings, result.best.point, descents, noise, drift)[0]
+            added = information(problem.readings, result.best.point, attempt, noise, drift)[0]
             after = np.linalg.inv(known + without_pose(added, pose_prior(problem.recordings.task)))
         except SimulationError:
             continue

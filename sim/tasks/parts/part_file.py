@@ -30,19 +30,22 @@ def part_names() -> tuple[str, ...]:
     return tuple(sorted(Path(file.name).stem for file in _folder().iterdir() if file.name.endswith(".toml")))
 
 
-def shipped_mesh(part: Part) -> "TriangleMesh | None":
-    """The mesh of a part of gelflow in the frame of the part [m], also where `mesh_file` is unknown, as in a session.
+def with_shipped_mesh(part: Part) -> Part:
+    """The part with the file of its mesh if this comes with gelflow; descriptions hold only the digest of a file."""
+    from gelflow.sim.tasks.parts import mesh_file
 
-    None for other parts: their descriptions hold only the digest of the mesh file.
-    """
-    if not part.mesh:
-        return None
-    from gelflow.sim.tasks.parts import mesh_file, mesh_part
-
-    for file in Path(str(_folder())).glob("*.obj"):
+    for file in Path(str(_folder())).glob("*.obj") if part.mesh else ():
         if part.mesh == mesh_file.file_digest(file):
-            return mesh_part.MeshPart(replace(part, mesh_file=str(file))).mesh
-    return None
+            return replace(part, mesh_file=str(file))
+    return part
+
+
+def shipped_mesh(part: Part) -> "TriangleMesh | None":
+    """The mesh of a part of gelflow in the frame of the part [m], also with unknown `mesh_file`; None for others."""
+    from gelflow.sim.tasks.parts import mesh_part
+
+    found = with_shipped_mesh(replace(part, mesh_file=""))
+    return mesh_part.MeshPart(found).mesh if found.mesh_file else None
 
 
 def load_part(part: str | Path) -> InsertionTask:

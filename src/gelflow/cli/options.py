@@ -104,12 +104,12 @@ def add_checkpoint(parser: argparse.ArgumentParser, *, default: str = "the inclu
     )
 
 
-def add_part(parser: argparse._ActionsContainer) -> None:
-    """`--part`: the part to insert."""
+def add_part(parser: argparse._ActionsContainer, text: str = "part to insert", *, default: str = "the cuboid") -> None:
+    """`--part`: the part; `text` and `default` describe its use."""
     parser.add_argument(
         "--part",
         metavar="PART",
-        help="part to insert: a part file, or the name of a part of gelflow, such as peg (default: the cuboid)",
+        help=f"{text}: a part file, or the name of a part of gelflow, such as peg (default: {default})",
     )
 
 

@@ -4,6 +4,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from gelflow.cli.output import progress_bar
 from gelflow.errors import PeerError, UsageError
 from gelflow.observation import TactileFrame
@@ -36,6 +39,16 @@ def replay_with_progress(
             comparisons.append(comparison)
             progress.advance(bar)
     return comparisons
+
+
+def visible_markers(description: Mapping[str, Any]) -> list[NDArray[np.bool_]]:
+    """Which printed markers of each pad its camera shows, (markers,) each; empty where a session does not name them."""
+    from gelflow.perception.frames import CameraMount
+
+    if not all("pitch" in mount for mount in description["mounts"]):
+        return []
+    mounts = described(CameraMount, description, "mounts", what="camera mount")
+    return [mount.marker_order() >= 0 for mount in mounts]
 
 
 def _recorded_perception(description: Mapping[str, Any]) -> tuple[InsertionTask, PerceptionPipeline]:

@@ -7,7 +7,9 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from gelflow.cli.exit_codes import SUCCESS
+from gelflow.cli.options import part_task
 from gelflow.cli.output import Output, progress_bar
+from gelflow.cli.session_replay import visible_markers
 from gelflow.figures import save
 from gelflow.policies.calibration.comparison import NOTHING_IN_COMMON, noisy_markers_text, simulate
 from gelflow.policies.calibration.flow_picture import draw_flow_maps
@@ -17,7 +19,8 @@ from gelflow.policies.calibration.session_recordings import read_recordings
 def replay_in_simulation(args: argparse.Namespace) -> int:
     """Simulate the attempts with contact of a session, and print the error of each flow map."""
     output = Output(args.json)
-    recordings = read_recordings([args.session])
+    part = None if args.part is None else part_task(args.part).part
+    recordings = read_recordings([args.session], part=part, visible_markers=visible_markers)
     with progress_bar(count=True) as progress:
         bar = progress.add_task("simulating", total=len(np.unique(recordings.insertion)))
         result = simulate(recordings, progress=lambda done: progress.update(bar, completed=done))

@@ -81,7 +81,7 @@ def save_motion_plan(motions: tuple[PlannedMotion, ...], path: Path, *, title: s
     for m in motions:
         pose = {"x": round(m.x, 7), "y": round(m.y, 7), "yaw_deg": round(math.degrees(m.yaw), 5)}
         stop = {} if m.stop_shear_mm is None else {_STOP: m.stop_shear_mm}
-        rows.append({**pose, "depth": round(m.depth, 7), **stop})
+        rows.append({**pose, "depth": round(m.depth, 9), **stop})
     heading = (
         f"# {title}\n# Poses of the gripper relative to the taught hole, and the largest depth of each descent, [m];\n"
         f"# contact stops it earlier, at {_STOP} of mean shear along the finger (without it, that of the lab file).\n"

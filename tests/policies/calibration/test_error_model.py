@@ -102,6 +102,6 @@ def test_a_search_of_poses_has_the_cost_of_its_result(world: RecordedWorld) -> N
     problem = Problem(with_noise(world.recordings.of(np.array([0])), 10.0), threads=1)
     problem.allow_for(drift=1e-3)
     start = find_poses(problem, problem.scene_point(), np.random.default_rng(0))
-    cost, point, poses = refined_poses(problem, *start, np.random.default_rng(1), sizes=(0.05,), count=8)
+    cost, point, poses = refined_poses(problem, *start, np.random.default_rng(1), count=8)
     residuals, _ = problem.residuals(point, poses)
     assert cost == pytest.approx(problem.cost(residuals, point) + prior_cost_of_all(problem, poses[None])[0])

@@ -13,9 +13,9 @@ from gelflow.policies.calibration.experiment.worlds import RecordedWorld, record
 from gelflow.policies.calibration.fit import FitResult, StartResult
 from gelflow.policies.calibration.model.reading_model import ReadingModel
 from gelflow.policies.calibration.model.shear_model import Descents
-from gelflow.policies.calibration.planning.information import information, pose_prior, without_pose
+from gelflow.policies.calibration.planning.information import Attempts, information, pose_prior, without_pose
 from gelflow.policies.calibration.planning.motions import STOP_SHEAR_MM, plan_motions
-from gelflow.policies.calibration.problem import Problem
+from gelflow.policies.calibration.problem import POSE_STEP, Problem, in_hole
 from gelflow.policies.calibration.session_recordings import nothing_recorded
 from gelflow.policies.calibration.uncertainty import covariance
 from gelflow.session.motion_plan import PlannedMotion, load_motion_plan, save_motion_plan
@@ -54,13 +54,33 @@ def test_files_that_are_no_plan_are_refused(tmp_path: Path, text: str, message: 
 def test_attempts_without_contact_have_no_information(world: RecordedWorld) -> None:
     readings = ReadingModel(world.recordings, threads=1)
     count = len(readings.fitted)
-    descents = Descents(np.array([[8e-3, 0.0, 0.0], [8e-3, 0.0, 0.0]]), np.zeros(2), np.array([0.9e-3, 0.1e-3]))
-    touching, free = information(readings, np.zeros(count), descents, 1e-4)
+    pose = np.array([[8e-3, 0.0, 0.0], [8e-3, 0.0, 0.0]])
+    attempts = Attempts(np.zeros((2, 3)), pose, np.zeros(2), np.array([0.9e-3, 0.1e-3]))
+    touching, free = information(readings, np.zeros(count), attempts, 1e-4)
     for matrix in (touching, free):
         assert np.linalg.eigvalsh(matrix).min() > -1e-8 * np.abs(touching).max()
     assert np.trace(touching) > 1e3 * np.trace(free)
     known = without_pose(touching, pose_prior(INSERTION))
     assert (np.diag(known) <= np.diag(touching[:count, :count]) * (1 + 1e-9)).all()
+
+
+def test_the_information_is_that_about_the_misalignment_of_the_part(world: RecordedWorld) -> None:
+    """An error of the taught yaw also displaces a gripper that is beside the hole."""
+    readings = ReadingModel(world.recordings, threads=1)
+    point, count = np.zeros(len(readings.fitted)), len(readings.fitted)
+    n, (dx, dy) = 8, 9e-3 * np.array([np.cos(np.arange(8) * np.pi / 4), np.sin(np.arange(8) * np.pi / 4)])
+    misalignment, planar = np.tile((1e-3, -2e-3, 0.05), (n, 1)), np.column_stack([dx, dy, np.full(n, 0.1)])
+    attempts = Attempts(misalignment, planar, np.zeros(n), np.full(n, 0.9e-3))
+    found = information(readings, point, attempts, 1e-4, drift=0.0)[:, count + 2, count + 2]
+
+    def reading(yaw: float) -> np.ndarray:
+        values = {name: np.full(n, value) for name, value in readings.values(point).items()}
+        pose = in_hole(misalignment + np.array([0.0, 0.0, yaw]), planar)
+        return readings.read(values, Descents(pose, attempts.z, attempts.depth))[0]
+
+    slope = (reading(POSE_STEP[2]) - reading(-POSE_STEP[2])) / 2
+    bound = (slope**2).sum((1, 2)) / 1e-8  # without errors of the model and of the height
+    assert (found <= bound + 1e-9).all() and found.max() > 0.01 * bound.max() > 0.1
 
 
 @pytest.mark.slow
@@ -127,8 +147,10 @@ def test_calibrate_refuses_contradicting_options(tmp_path: Path, capsys: pytest.
     for words, message in (
         ([], "name a recorded session, or a new plan file with --plan"),
         (["--lab", "lab.toml", "a.mcap"], "--lab gives the limits of --plan"),
-        (["a.mcap", "--part", "peg"], "a session contains its part"),
         (["--plan", str(plan), "--motions", "0"], "--motions must be at least 1"),
+        (["a.mcap", "--motions", "3"], "--motions is the number of attempts of --plan"),
+        (["--plan", str(plan), "--quick"], "--quick is for the fit of a SESSION"),
+        (["a.mcap", "--seed", "-1"], "--seed must be at least 0"),
     ):
         assert main(["calibrate", *words]) == 2
         assert message in capsys.readouterr().err
@@ -147,7 +169,8 @@ def test_calibrate_writes_a_plan_within_the_workspace_of_the_lab(
     lab.write_text(example.read_text().replace("# x = 0.016 ", "x = 0.004 ").replace("# y = 0.016 ", "y = 0.004 "))
     lab.write_text(lab.read_text().replace("# planned_stop_shear_mm = 0.25", "planned_stop_shear_mm = 0.2"))
     assert main(["calibrate", "--plan", str(plan), "--lab", str(lab), "--motions", "2"]) == 0
-    assert "record it with: gelflow run insertion --lab LAB --plan" in capsys.readouterr().out
+    command = f"gelflow run insertion --lab {lab} --plan {plan} --insertions 2"
+    assert f"record it with: {command}" in capsys.readouterr().out
     motions = load_motion_plan(plan)
     assert len(motions) == 2
     assert not any(m.beyond((4e-3, 4e-3, 0.28), INSERTION.descent, (0.04, 0.2)) for m in motions)

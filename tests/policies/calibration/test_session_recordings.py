@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from gelflow.cli.main import main
+from gelflow.cli.session_replay import visible_markers
 from gelflow.clock import ScaledClock
 from gelflow.errors import UsageError
 from gelflow.perception.frames import CameraMount
@@ -21,6 +22,7 @@ from gelflow.policies.calibration.session_recordings import read_recordings
 from gelflow.session import SessionRecorder
 from gelflow.session.records import Decision, describe_session
 from gelflow.sim.scene import load_scene
+from gelflow.sim.tasks.parts import load_part
 from gelflow.task import INSERTION
 
 LAB = {"gripper": {"grasp_force": 12.0}, "part": {"grasp_height": 0.03}}
@@ -138,6 +140,36 @@ def test_sessions_that_cannot_be_calibrated_are_refused(tmp_path: Path, world: R
     usual, deeper = write_session(tmp_path / "a.mcap", world), write_session(tmp_path / "b.mcap", world, descent=2e-3)
     with pytest.raises(UsageError, match="another part or task"):
         read_recordings([usual, deeper])
+
+
+def test_meshes_of_parts_come_from_gelflow_or_from_the_part_file(tmp_path: Path, world: RecordedWorld) -> None:
+    hexagon = load_part("hexagon").part
+    shipped = write_session(tmp_path / "hexagon.mcap", world, part=hexagon.to_json())
+    assert Path(read_recordings([shipped]).task.part.mesh_file).samefile(hexagon.mesh_file)
+    own = dataclasses.replace(hexagon, mesh="0" * 64, mesh_file="own.obj")
+    session = write_session(tmp_path / "own.mcap", world, part=own.to_json())
+    with pytest.raises(UsageError, match="the part is a mesh, which a session does not contain; add --part"):
+        read_recordings([session])
+    assert read_recordings([session], part=own).task.part.mesh_file == "own.obj"
+    with pytest.raises(UsageError, match="another part than --part"):
+        read_recordings([session], part=hexagon)
+
+
+def test_markers_that_the_camera_does_not_show_are_not_compared(tmp_path: Path, world: RecordedWorld) -> None:
+    mount = CameraMount(rows=13, cols=10, pitch=1.5, visible_rows=(1, 11), pixels_per_mm=12.0)
+    session = write_session(tmp_path / "part.mcap", world, mount=mount)
+    everything = read_recordings([session]).used
+    used = read_recordings([session], visible_markers=visible_markers).used
+    assert (everything | ~used).all()
+    for hidden in np.logical_not(used.reshape(2, 13, 10).any(2)):
+        assert hidden.sum() == 2 and (hidden[:2].all() or hidden[-2:].all())
+
+
+def test_values_that_are_not_finite_are_refused(tmp_path: Path, world: RecordedWorld) -> None:
+    recordings = dataclasses.replace(world.recordings, depth=world.recordings.depth * np.nan)
+    session = write_session(tmp_path / "nan.mcap", dataclasses.replace(world, recordings=recordings))
+    with pytest.raises(UsageError, match=r"nan\.mcap: insertion 0, attempt 0 contains values that are not finite"):
+        read_recordings([session])
 
 
 def test_replay_compares_flow_maps_with_the_simulation(

@@ -11,13 +11,31 @@ from typing import Any
 from rich.table import Table
 
 from gelflow.cli.exit_codes import SUCCESS
-from gelflow.cli.options import add_json, add_out, add_part, add_quick, add_seed, check_at_least, part_task
+from gelflow.cli.options import (
+    add_json,
+    add_out,
+    add_part,
+    add_quick,
+    add_seed,
+    check_at_least,
+    part_task,
+    removed_on_error,
+)
 from gelflow.cli.output import Output, progress_bar
+from gelflow.cli.session_replay import visible_markers
 from gelflow.errors import UsageError
+from gelflow.part import CUBOID
 from gelflow.policies.calibration.calibrated_scene import MODEL, SCENE, write_scene
 from gelflow.policies.calibration.calibration import Calibration, calibrate
 from gelflow.policies.calibration.fit import FitResult, FitSettings
-from gelflow.policies.calibration.planning.motions import MOTIONS, SCENARIOS, STOP_SHEAR_MM, Plan, plan_motions
+from gelflow.policies.calibration.planning.motions import (
+    MOTIONS,
+    SCENARIOS,
+    STOP_SHEAR_MM,
+    Plan,
+    candidates,
+    plan_motions,
+)
 from gelflow.policies.calibration.recordings import Recordings
 from gelflow.policies.calibration.report import advice_lines, error_lines, page, plain_report
 from gelflow.policies.calibration.session_recordings import nothing_recorded, read_recordings
@@ -40,13 +58,18 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="also write the attempts with the most information about what is unknown, for gelflow run insertion "
         "--plan; without a SESSION nothing is known",
     )
+    parser.add_argument("--motions", type=int, metavar="N", help=f"number of attempts of --plan (default {MOTIONS})")
     parser.add_argument(
-        "--motions", type=int, default=MOTIONS, metavar="N", help="number of attempts of --plan (default %(default)s)"
+        "--lab",
+        type=Path,
+        metavar="FILE",
+        help="lab file whose workspace and largest shear --plan keeps to, and without a SESSION its grasp and markers",
     )
-    parser.add_argument(
-        "--lab", type=Path, metavar="FILE", help="lab file whose workspace, grasp and largest shear --plan keeps to"
+    add_part(
+        parser,
+        "part of the plan or of the sessions, which do not contain meshes",
+        default="the cuboid, or that of the sessions",
     )
-    add_part(parser)
     add_out(
         parser, "new folder for report.html, report.json and scene.toml", default=Path("out/calibration"), folder=True
     )
@@ -71,7 +94,10 @@ def run(args: argparse.Namespace) -> int:
     for file in files:
         if file.exists():
             raise UsageError(f"{file} exists; name a new folder with --out")
-    recordings = read_recordings(args.sessions)
+    part = None if args.part is None else part_task(args.part).part
+    recordings = read_recordings(args.sessions, part=part, visible_markers=visible_markers)
+    if args.plan is not None:
+        candidates(recordings.task, _workspace(lab))
     create_folder(args.out)
     settings = _QUICK if args.quick else FitSettings()
     with progress_bar(count=True) as progress:
@@ -83,32 +109,45 @@ def run(args: argparse.Namespace) -> int:
             processes=min(settings.starts, os.cpu_count() or 1),
             progress=lambda done: progress.update(bar, completed=done),
         )
-    report = plain_report(result, args.sessions)
-    try:
-        files[0].write_text(readable_json(report), "utf-8")
-        files[1].write_text(page(result, args.sessions, recordings.task.grid), "utf-8", "replace")
-        scene = write_scene(result, args.out)
-    except OSError as error:
-        raise UsageError(f"cannot write the report to {args.out}: {error}") from error
     if not output.json:
         _show(output, result)
-        output.text(f"the report is {files[1]}")
-        if scene:
-            output.text(f"the scene with the known values is {scene[0]}")
+    report = plain_report(result, args.sessions)
+    try:
+        with removed_on_error(*files):
+            _write_new(files[0], readable_json(report))
+            _write_new(files[1], page(result, args.sessions, recordings.task.grid))
+            scene = write_scene(result, args.out)
+    except OSError as error:
+        raise UsageError(f"cannot write the report to {args.out}: {error}") from error
+    output.text(f"the report is {files[1]}")
+    if scene:
+        output.text(f"the scene with the known values is {scene[0]}")
     plan = {} if args.plan is None else {"plan": _write_plan(args, lab, output, recordings, result.fit)}
     output.result(report | plan)
     return SUCCESS
 
 
+def _write_new(file: Path, text: str) -> None:
+    """Write a new file. Raises FileExistsError where another calibration has written one meanwhile."""
+    with file.open("x", encoding="utf-8", errors="replace") as out:
+        out.write(text)
+
+
 def _check(args: argparse.Namespace) -> None:
     """Raise UsageError for options that contradict each other, before anything is computed."""
-    check_at_least(args, motions=1)
+    check_at_least(args, seed=0)
+    if args.motions is not None:
+        check_at_least(args, motions=1)
+        if args.plan is None:
+            raise UsageError(
+                "--motions is the number of attempts of --plan; name the plan file, or leave --motions out"
+            )
     if not args.sessions and args.plan is None:
         raise UsageError("name a recorded session, or a new plan file with --plan")
     if args.plan is None and args.lab is not None:
         raise UsageError("--lab gives the limits of --plan; name the plan file, or leave --lab out")
-    if args.sessions and args.part is not None:
-        raise UsageError("a session contains its part; leave --part out")
+    if not args.sessions and args.quick:
+        raise UsageError("--quick is for the fit of a SESSION; leave it out")
     if args.plan is not None and args.plan.exists():
         raise UsageError(f"{args.plan} exists; name a new file with --plan")
 
@@ -127,17 +166,15 @@ def _write_plan(
     args: argparse.Namespace, lab: Lab | None, output: Output, recordings: Recordings, fitted: FitResult | None
 ) -> list[dict[str, Any]]:
     """Make, write and print a plan; returns its motions as plain data."""
-    workspace, stop = None, STOP_SHEAR_MM
-    if lab is not None:
-        workspace = (lab.workspace.x, lab.workspace.y, math.radians(lab.workspace.yaw_deg))
-        stop = lab.descent.largest_stop_shear_mm
+    stop = STOP_SHEAR_MM if lab is None else lab.descent.largest_stop_shear_mm
+    wanted = MOTIONS if args.motions is None else args.motions
     with progress_bar(count=True) as progress:
         bar = progress.add_task("planning", total=SCENARIOS)
         plan = plan_motions(
             recordings,
             fitted=fitted,
-            count=args.motions,
-            workspace=workspace,
+            count=wanted,
+            workspace=_workspace(lab),
             stop_shear_mm=stop,
             seed=args.seed,
             progress=lambda done: progress.update(bar, completed=done),
@@ -146,9 +183,24 @@ def _write_plan(
     save_motion_plan(plan.motions, args.plan, title=f"Written by gelflow calibrate --plan for {known}.")
     for line in _plan_lines(plan):
         output.text(line)
-    name = shlex.quote(str(args.plan))
-    output.text(f"the plan is {args.plan}; record it with: gelflow run insertion --lab LAB --plan {name}")
+    if len(plan.motions) < wanted:
+        output.text(f"the workspace has {len(plan.motions)} motions to choose from, fewer than --motions {wanted}")
+    output.text(f"the plan is {args.plan}; record it with: {_run_command(args, recordings)}")
     return [dataclasses.asdict(motion) | {"gain": gain} for motion, gain in zip(plan.motions, plan.gains, strict=True)]
+
+
+def _workspace(lab: Lab | None) -> tuple[float, float, float] | None:
+    """Largest |x|, |y| [m] and |yaw| [rad] of a plan; None: those of the task."""
+    return None if lab is None else (lab.workspace.x, lab.workspace.y, math.radians(lab.workspace.yaw_deg))
+
+
+def _run_command(args: argparse.Namespace, recordings: Recordings) -> str:
+    """The command that records the plan on two parts, so that one of them can be held out."""
+    words = ["gelflow", "run", "insertion", "--lab", "LAB" if args.lab is None else str(args.lab)]
+    part = recordings.task.part
+    if args.part is not None or part != CUBOID:
+        words += ["--part", part.name if args.part is None else args.part]
+    return shlex.join([*words, "--plan", str(args.plan), "--insertions", "2"])
 
 
 def _plan_lines(plan: Plan) -> list[str]:

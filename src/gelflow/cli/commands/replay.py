@@ -12,7 +12,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from gelflow.cli.exit_codes import NEGATIVE_RESULT, SUCCESS
-from gelflow.cli.options import add_checkpoint, add_json, add_out, check_new_file
+from gelflow.cli.options import add_checkpoint, add_json, add_out, add_part, check_new_file
 from gelflow.cli.output import Output
 from gelflow.cli.session_replay import recorded_pipeline, replay_with_progress
 from gelflow.errors import UsageError
@@ -33,6 +33,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--simulate", action="store_true", help="compare the flow maps with the simulation instead, error per decision"
     )
+    add_part(parser, "part of --simulate, where the session does not contain its mesh", default="that of the session")
     add_out(parser, "a picture (.png) of flow maps and corrections, recorded and recomputed or simulated")
     add_json(parser)
 
@@ -46,6 +47,8 @@ def run(args: argparse.Namespace) -> int:
         check_new_file(args.out, suffixes=PICTURE_FORMATS)
     if args.simulate:
         return _replay_in_simulation(args)
+    if args.part is not None:
+        raise UsageError("--part is for --simulate: a replay uses the part of the session; leave it out")
     output = Output(args.json)
     with SessionReader(args.session) as session:
         description = session.description()
@@ -152,6 +155,10 @@ def _notes(description: Mapping[str, Any], checkpoint: Path | None) -> list[str]
     recorded = description.get("checkpoint")
     if checkpoint and recorded and file_digest(checkpoint) != recorded["digest"]:
         notes.append(f"{checkpoint} is not the policy that the session ran")
+    if checkpoint and not recorded:
+        notes.append(
+            f"the session names no policy, as that of a motion plan: its actions need not be those of {checkpoint}"
+        )
     installed = software_versions()
     for name, version in (_FORMER_VERSIONS | (description.get("versions") or {})).items():
         if installed.get(name) != version:
