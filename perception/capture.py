@@ -20,6 +20,7 @@ Image = NDArray[np.uint8]
 
 _PORTS = {"http": 80, "https": 443, "rtsp": 554, "rtmp": 1935}  # default ports of the protocols over TCP
 _MISSING, _MISSING_SHARE = 2, 0.02  # images at the end of a video that its container may announce in excess
+_ROUNDING = 1.001e-3  # largest error of the time of an image in a video with an even rate [s]
 _LARGEST_INT = 2**31 - 1  # that OpenCV takes as the number of a camera
 _BACKLOG = 8  # live images that wait for the program
 # Silences FFmpeg; OpenCV reads the variable at the first use of FFmpeg.
@@ -64,11 +65,15 @@ class Capture:
         capture = self._open()
         rate = capture.get(cv2.CAP_PROP_FPS)
         rate = rate if 0.1 <= rate <= 1000 else self.rate
-        expected, number, seconds = capture.get(cv2.CAP_PROP_FRAME_COUNT), 0, 0.0
+        expected, number, seconds, first = capture.get(cv2.CAP_PROP_FRAME_COUNT), 0, 0.0, 0.0
         try:
             while (image := _read(capture)) is not None:
-                seconds = max(seconds, capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3)
-                yield CapturedImage(image, number / rate)
+                stated = capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3
+                first = first if number else stated
+                # The rate may be uneven. Some containers round the time of an image to milliseconds.
+                uneven = stated > seconds and abs(stated - first - number / rate) > _ROUNDING
+                seconds = max(seconds, stated)
+                yield CapturedImage(image, stated - first if uneven else number / rate)
                 number += 1
         finally:
             capture.release()
@@ -135,7 +140,8 @@ class Capture:
                 advice = f"no video stream within {self.timeout:g} s; check address and port"
             else:
                 self._check_not_text()
-                capture = cv2.VideoCapture(self.text, cv2.CAP_FFMPEG)
+                # FFmpeg takes the text before a colon in a relative path for a protocol.
+                capture = cv2.VideoCapture(str(Path(self.text).absolute()), cv2.CAP_FFMPEG)
                 advice = "not an image or a video that OpenCV can read"
         finally:
             cv2.utils.logging.setLogLevel(level)

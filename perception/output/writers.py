@@ -195,7 +195,7 @@ class OverlayWriter:
         pictures = [self._draw(step) for step in waiting]
         size = (pictures[0].shape[1], pictures[0].shape[0])
         code = cv2.VideoWriter.fourcc(*VIDEO_CODECS[self._path.suffix.lower()])
-        video = cv2.VideoWriter(str(self._path), cv2.CAP_FFMPEG, code, rate, size)
+        video = cv2.VideoWriter(str(self._path.absolute()), cv2.CAP_FFMPEG, code, rate, size)
         if not video.isOpened():
             raise UsageError(
                 f"cannot write the video {self._path} of {size[0]} × {size[1]} px at {rate:g} images/s: use another "

@@ -1,5 +1,6 @@
 """Image sources with damaged content: folders, videos, sessions, and a stream whose image size changes."""
 
+import re
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -177,6 +178,35 @@ def test_images_of_a_profile_are_reduced_and_cropped(tmp_path: Path) -> None:
     whole = cv2.imdecode(np.frombuffer(stream.images[3], dtype=np.uint8), cv2.IMREAD_REDUCED_COLOR_4)
     assert whole is not None
     np.testing.assert_array_equal(seen[3].image, whole[0:32, 12:72])
+
+
+def test_a_relative_name_of_a_video_may_contain_a_colon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    size = (64, 48)
+    video = cv2.VideoWriter(str(tmp_path / "12:30.mkv"), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"MJPG"), 25.0, size)
+    for number in range(3):
+        video.write(picture(number, size))
+    video.release()
+    assert names(image_source("12:30.mkv")) == ["000000", "000001", "000002"]
+
+
+def test_images_of_a_video_with_an_uneven_rate_have_their_own_times(tmp_path: Path) -> None:
+    path = tmp_path / "uneven.mkv"
+    video = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"MJPG"), 25.0, (64, 48))
+    for number in range(10):
+        video.write(np.full((48, 64, 3), 20 * number, dtype=np.uint8))
+    video.release()
+    even = [image.stamp for image in image_source(str(path))]
+    np.testing.assert_allclose(even, np.arange(10) / 25)
+    # A block is the number of its track, its time [ms] in two bytes, flags, and the JPEG image.
+    head, *blocks = re.split(rb"(?=\x81...\xff\xd8)", path.read_bytes(), flags=re.DOTALL)
+    assert len(blocks) == 10
+    for k in range(5, 10):
+        late = int.from_bytes(blocks[k][1:3], "big") + 100
+        blocks[k] = blocks[k][:1] + late.to_bytes(2, "big") + blocks[k][3:]
+    path.write_bytes(head + b"".join(blocks))
+    uneven = [image.stamp for image in image_source(str(path))]
+    np.testing.assert_allclose(uneven, np.arange(10) / 25 + 0.1 * (np.arange(10) >= 5), atol=2e-3)
 
 
 @pytest.mark.parametrize("kept", [0, 300])  # without its first bytes it cannot be recognized as a JPEG image

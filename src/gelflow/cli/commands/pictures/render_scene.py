@@ -121,7 +121,7 @@ def _write_film(path: Path, pictures: Any, size: tuple[int, int], fps: float, co
 
     pictures = iter(pictures)
     first = next(pictures)  # before the file is created: an error of the drawing leaves no empty film
-    video = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*codec), fps, size)
+    video = cv2.VideoWriter(str(path.absolute()), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*codec), fps, size)
     if not video.isOpened():
         raise UsageError(f"cannot write the film {path}; is its folder writable?")
     for picture in itertools.chain([first], pictures):
