@@ -210,6 +210,7 @@ def collect(
 ) -> tuple[Attempts, float, float]:
     """`rollout` attempts per environment of the policy with exploration, its success rate, and its mean reward.
 
+    The success rate is that of the first part of each environment: of later ones only those end that need few attempts.
     The standard deviation of the exploration is drawn for each part, up to `sigma`.
     """
     description, reach = network.task, np.asarray(network.reach)
@@ -219,7 +220,7 @@ def collect(
     spread = sigma * rng.uniform(size=(task.num_envs, 1))
     explored = np.array([1.0, 1.0, 0.0 if description.part.is_round else 1.0])
     inputs, targets, starts, rewards = [], [], [], []
-    ended = inserted = 0
+    first, ended, inserted = task.all.copy(), 0, 0
     for _ in range(rollout):
         starts.append(policy.new.copy())
         inputs.append(policy.observe(task.observation).astype(np.float32))
@@ -231,8 +232,9 @@ def collect(
         task.step(corrections / np.asarray(description.action_scale), parts)
         rewards.append(task.reward.mean())
         done = task.terminated | task.truncated
-        ended += int(done.sum())
-        inserted += int(task.terminated.sum())
+        ended += int((done & first).sum())
+        inserted += int((task.terminated & first).sum())
+        first &= ~done
         if done.any():
             task.reset(done, parts)
             policy.reset(done)

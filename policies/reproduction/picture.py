@@ -49,7 +49,7 @@ def _draw_curves(axes: Any, variants: Sequence[Mapping[str, Any]], measure: str)
                 continue
             x, median, low, high = (np.array(values[key]) for key in ("x", "median", "low", "high"))
             if name == "training":
-                # After a validation new episodes start, and the first row has only those that ended early.
+                # The success of a row is that of few episodes.
                 median, low, high = (median_filter(values, _SMOOTHED, mode="nearest") for values in (median, low, high))
             every, marks = max(1, len(x) // 10), marker if name == "validation" else None
             label = variant["name"] if name == "validation" else None

@@ -81,7 +81,7 @@ def read_curves(runs: Sequence[Run], records: Mapping[str, RunRecord], column: s
         pairs = [pair for pair in pairs if len(pair[0])]
         if pairs:
             found.append(combine(values, pairs))
-    return Curves(x_name, y_name, found)
+    return Curves(x_name, y_name, found) if found else None
 
 
 def draw(path: Path, curves: Curves, task: str) -> None:

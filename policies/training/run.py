@@ -269,8 +269,10 @@ def locked(folder: Path) -> Iterator[None]:
     with file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
+        except BlockingIOError as error:
             raise UsageError(f"{folder} is in use by another run; choose another folder") from error
+        except OSError:  # a file system without locks
+            pass
         yield
 
 

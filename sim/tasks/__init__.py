@@ -1,1 +1,1 @@
-"""Tasks built on the simulator: batched insertion attempts and their Gymnasium environments."""
+"""Tasks built on the simulator, with their batches and Gymnasium environments."""

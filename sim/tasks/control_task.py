@@ -123,5 +123,6 @@ class ControlTask(TaskBatch):
     def _end_episodes(self, active: Mask) -> None:
         self.info["failed"][active] = (self.sim.status != 0)[active]
         over = self.info["failed"] | (self.info["steps"] >= self._max_steps)
-        self.terminated[active] &= ~self.info["failed"][active]
+        for result in (self.terminated, self.info["success"]):
+            result[active] &= ~self.info["failed"][active]
         self.truncated[active] = (over & ~self.terminated)[active]

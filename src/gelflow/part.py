@@ -11,6 +11,7 @@ from gelflow.errors import UsageError
 
 SHAPES = ("box", "cylinder", "mesh")
 _FITS_FINGERS = 0.100  # largest distance between the pads [m]
+_LONGEST, _WIDEST_CLEARANCE = 0.256, 0.020  # of a part, and of its hole [m]: larger ones are in another unit
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,9 @@ class Part:
             value = getattr(self, name)
             if not all(0 < v < np.inf for v in (value if isinstance(value, tuple) else (value,))):
                 raise UsageError(f"{name} must be above 0, got {list(value) if isinstance(value, tuple) else value}")
+        for name, values, most in (("size", self.size, _LONGEST), ("clearance", self.clearance, _WIDEST_CLEARANCE)):
+            if max(values) > most:
+                raise UsageError(f"{name} may be at most {most:g} m, got {list(values)}; lengths are in metres")
         if self.grasp_width > _FITS_FINGERS:
             raise UsageError(
                 f"the part is {self.grasp_width:g} m wide between the pads (grasp_width), which may be at most "

@@ -32,7 +32,7 @@ _ROUND = (2, 3, 5, 7, 11)  # a shape with all of these rotations is round
 
 
 def centred(mesh: TriangleMesh) -> tuple[TriangleMesh, Array]:
-    """The mesh with its bounding box centred at the origin, and the former place of the centre [m]."""
+    """The mesh with its bounding box centred at the origin, and the former position of the centre [m]."""
     centre = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
     return TriangleMesh(mesh.vertices - centre, mesh.faces), centre
 
@@ -67,17 +67,17 @@ def found_symmetry(mesh: TriangleMesh, name: str) -> tuple[int, tuple[str, ...]]
 
 
 def rotation_error(mesh: TriangleMesh, name: str, rotations: int) -> float:
-    """Largest distance [m] of a mesh from itself after the rotations of `Part.symmetry`."""
+    """Largest distance [m] of a mesh from itself after any of the rotations of `Part.symmetry`."""
     points = _samples(mesh)
-    turns = (rotations,) if rotations else _ROUND
-    return max(_largest_distance(mesh, _turned(points, parts), name) for parts in turns)
+    turns = [rotations / k for k in range(1, rotations)] if rotations else _ROUND
+    return max((_largest_distance(mesh, _turned(points, parts), name) for parts in turns), default=0.0)
 
 
 def _samples(mesh: TriangleMesh) -> Array:
     return np.concatenate([mesh.vertices, mesh_surface(mesh, count=400)[0]])
 
 
-def _turned(points: Array, parts: int) -> Array:
+def _turned(points: Array, parts: float) -> Array:
     """Points after 1/parts of a turn about z."""
     cos, sin = np.cos(2 * np.pi / parts), np.sin(2 * np.pi / parts)
     return np.asarray(points @ np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]]))

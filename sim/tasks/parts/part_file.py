@@ -19,6 +19,7 @@ FORMAT = 1
 
 _DEFAULT_DENSITY = 1000.0  # [kg/m³]
 _HEAVIEST = 8.0  # [kg]; two pads hold 80 N at the largest grasp force (16 N) and friction (2.5) of the randomization
+_MOST_ROTATIONS = 72
 _TABLES = ("format", "name", "part", "hole", "grasp", "descent", "misalignment", "symmetry")
 _PART_KEYS = {"box": ("size",), "cylinder": ("diameter", "height"), "mesh": ("file", "scale")}
 _WEIGHTS = ("density", "mass")
@@ -81,7 +82,8 @@ def _read_part(top: TomlTable, path: Path) -> Part:
 
 
 def _mirror(given: TomlTable) -> tuple[str, ...]:
-    return given.strings("mirror") if given.data["mirror"] else ()
+    axes = given.strings("mirror") if given.data["mirror"] else ()
+    return tuple(sorted(set(axes)))  # the order of the file has no meaning
 
 
 def _hole_fields(hole: TomlTable, path: Path, shape: str) -> dict[str, Any]:
@@ -199,6 +201,10 @@ def _check_rotations(part: Part, table: TomlTable) -> None:
     """Raises UsageError for rotations after which the mesh of a part does not fit into its hole."""
     from gelflow.sim.tasks.parts import mesh_part
 
+    if part.symmetry > _MOST_ROTATIONS:
+        raise UsageError(
+            f"{table.location}: rotations must be at most {_MOST_ROTATIONS}, or 0 for a round part, got {part.symmetry}"
+        )
     mesh, _ = mesh_part.centred(mesh_part.MeshPart(part).mesh)
     error, gap = mesh_part.rotation_error(mesh, part.name, part.symmetry), max(part.clearance) / 2
     if error > gap:

@@ -257,8 +257,10 @@ def is_being_recorded(stream: BinaryIO) -> bool:
     """Whether a running recorder holds the lock of this file."""
     try:
         fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except OSError:
+    except BlockingIOError:
         return True
+    except OSError:  # a file system without locks
+        return False
     fcntl.flock(stream, fcntl.LOCK_UN)
     return False
 

@@ -92,8 +92,9 @@ class SessionRecorder:
             stream = self.path.open("xb")
         except OSError as error:
             raise UsageError(f"cannot create {self.path}: {error.strerror}; use a writable folder") from error
-        # The lock distinguishes a session in progress from a crashed one.
-        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        # The lock distinguishes a session in progress from a crashed one, where the file system has locks.
+        with contextlib.suppress(OSError):
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
         self._thread = threading.Thread(target=self._write_all, args=(stream,), name="recorder", daemon=True)
         self._thread.start()
         return self
@@ -187,7 +188,7 @@ class SessionRecorder:
     def attempt_end(self, attempt: Mapping[str, Any] | None = None) -> None:
         """Record the result of an attempt (insertion, attempt, outcome and more) and store all records on the disk.
 
-        Returns when all records so far are stored. Raises PeerTimeout when that takes longer than `DISK_TIMEOUT`.
+        Returns when all records so far are stored. Raises as `check`, and PeerTimeout after `DISK_TIMEOUT`.
         """
         if attempt is not None:
             self._json("/attempt", attempt)

@@ -16,6 +16,7 @@ from gelflow.view.access import Access, guarded, is_loopback
 
 DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 8080
 _CONTROLS = 0.14  # height of the controls above a picture, in heights of the view
+_NARROWEST = 0.1  # smallest shape (width / height) of a view for which a picture is framed
 _BLANK = 250  # grey of the space around a picture
 _starting = threading.Lock()
 
@@ -61,7 +62,10 @@ class Page:
     def show_picture(self, picture: NDArray[np.uint8]) -> None:
         """Show a picture, RGB (height, width, 3), in the view of every browser, below its controls."""
         for client in self.server.get_clients().values():
-            framed = below_controls(picture, client.camera.aspect)
+            width, height = client.camera.image_width, client.camera.image_height
+            if width < 1 or height < 1:  # a window that is minimized, or not laid out yet
+                continue
+            framed = below_controls(picture, min(max(width / height, _NARROWEST), 1 / _NARROWEST))
             client.scene.set_background_image(framed, format="jpeg", jpeg_quality=85)
 
     def close(self) -> None:

@@ -177,6 +177,8 @@ class SimulationPage:
 
     def _choose_env(self, env: int) -> None:
         self.env = min(max(int(env), 0), self._sim.num_envs - 1)
+        if self._scene.actuators:
+            self._controls.show(self._u[self.env].tolist())
 
     def _single_step(self) -> None:
         self._set_playing(False)

@@ -307,7 +307,7 @@ def _clear(out: Path) -> None:
     try:
         out.mkdir(parents=True, exist_ok=True)
         old = [path for pattern in ("session*.mcap", "insertion-*.png") for path in sorted(out.glob(pattern))]
-        if old and not marker.exists() and out != _FOLDER:
+        if old and not marker.exists():
             raise UsageError(f"{old[0]} is not the file of a demo; name another folder with --out")
         for path in old:
             path.unlink()

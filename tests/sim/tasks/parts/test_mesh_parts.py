@@ -99,6 +99,30 @@ def test_a_symmetry_that_the_mesh_does_not_have_is_refused(tmp_path: Path) -> No
     assert load_part(written(tmp_path, prism(BOX, 60.0), f"{PART}[symmetry]\nrotations = 1\n")).part.symmetry == 1
 
 
+def test_all_multiples_of_a_rotation_must_fit(tmp_path: Path) -> None:
+    """A part without symmetry turned by 5° fits as well, but not when it is turned again and again."""
+    text = PART + "[symmetry]\nrotations = {}\n"
+    for rotations, message in ((36, "not equal after 1/36 of a turn"), (1000, "rotations must be at most 72")):
+        with pytest.raises(UsageError, match=message):
+            load_part(written(tmp_path, prism(BOX, 60.0), text.format(rotations)))
+    circle = 15 * np.column_stack([np.cos(np.arange(72) * np.pi / 36), np.sin(np.arange(72) * np.pi / 36)])
+    assert load_part(written(tmp_path, prism(circle, 60.0), text.format(72))).part.symmetry == 72
+
+
+def test_the_order_of_mirror_axes_has_no_meaning(tmp_path: Path) -> None:
+    parts = [load_part(written(tmp_path, prism(BOX, 60.0), f"{PART}[symmetry]\nmirror = {axes}\n")).part
+             for axes in ('["x", "y"]', '["y", "x"]')]  # fmt: skip
+    assert parts[0] == parts[1]
+
+
+@pytest.mark.parametrize(
+    ("changed", "name"), [({"clearance": (1.0, 1.0)}, "clearance"), ({"size": (0.03, 5.0, 0.06)}, "size")]
+)
+def test_lengths_in_another_unit_are_refused(changed: dict[str, tuple[float, ...]], name: str) -> None:
+    with pytest.raises(UsageError, match=rf"{name} may be at most .* lengths are in metres"):
+        dataclasses.replace(CUBOID, **changed)  # type: ignore[arg-type]
+
+
 def test_pads_meet_the_outermost_sides_at_their_height(tmp_path: Path) -> None:
     """A wedge that widens to the top: only the sides where the pads are count."""
     mesh = prism(BOX * 1e-3, 60e-3)
