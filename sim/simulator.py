@@ -339,9 +339,9 @@ class Simulator(StateArrays):
         """A part of the state over a rollout, in a new array or that of `out`, with its initial value."""
         present = getattr(self, name)
         array = np.zeros((steps + 1, *present.shape), present.dtype) if out is None else getattr(out, name)
+        fill(name, array[0], present if start is None else start)  # before: it may be the end of `out`
         if out is not None and name == "anchors":
             array[1:] = 0  # the core writes only the anchors that are set
-        fill(name, array[0], present if start is None else start)
         return array
 
     def contact_modes(self, trajectory: Trajectory) -> NDArray[np.uint64]:

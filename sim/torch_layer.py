@@ -95,14 +95,21 @@ def torch_rollout(
     for name, tensor in named.items():
         if not isinstance(tensor, torch.Tensor):
             raise UsageError(f"{name} must be a tensor of {expected}, got {type(tensor).__name__}")
-        if tensor.dtype != expected or tensor.device.type != "cpu":
-            raise UsageError(f"{name} must be a CPU tensor of {expected}, got {tensor.dtype} on {tensor.device}")
+        _check_tensor(name, tensor, expected)
+    _check_tensor("state.anchored", state.anchored, torch.uint8)
     numbers = None if params is None else _all_params(sim, params)
     inputs = (u, state.q, state.v, state.anchors, state.history, numbers, state.anchored)
     options = {"read_after": read_after, "reduction": reduction, "active": active, "stop": stop}
     outputs = _Rollout.apply(*inputs, sim, options)  # type: ignore[no-untyped-call]
     q, v, tactile, anchors, history, anchored, ok, stopped_at = outputs
     return TorchRollout(q, v, tactile, TorchState(q[-1], v[-1], anchors, anchored, history), ok, stopped_at)
+
+
+def _check_tensor(name: str, tensor: torch.Tensor, *dtypes: torch.dtype) -> None:
+    """Raise UsageError for a tensor of another type, or one that is not on the CPU."""
+    if tensor.dtype not in dtypes or tensor.device.type != "cpu":
+        wanted = " or ".join(map(str, dtypes))
+        raise UsageError(f"{name} must be a CPU tensor of {wanted}, got {tensor.dtype} on {tensor.device}")
 
 
 def _all_params(sim: Simulator, params: Mapping[str, torch.Tensor]) -> torch.Tensor:
@@ -137,6 +144,7 @@ def torch_site_poses(sim: Simulator, q: torch.Tensor) -> torch.Tensor:
     """
     check_type("sim", sim, Simulator, "a Simulator")
     check_type("q", q, torch.Tensor, "a tensor")
+    _check_tensor("q", q, torch.float32, torch.float64)
     return _SitePoses.apply(q, sim)  # type: ignore[no-untyped-call,no-any-return]
 
 

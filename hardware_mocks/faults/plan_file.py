@@ -50,6 +50,8 @@ def _read(table: TomlTable) -> Fault:
         if name in table.data:
             data[name] = table.integer(name, minimum=0)
     if "random" in table.data:
+        if "seed" in data:
+            raise UsageError(f"{table.location}: the seed of random times is `seed` of the table random")
         random = table.table("random").check_keys(("seed", "rate"))
         data |= {"rate": random.number("rate", minimum=1e-6), "seed": random.integer("seed", 0, minimum=0)}
     parameters = {name: table.number(name) for name in _PARAMETERS if name in table.data}

@@ -66,11 +66,11 @@ class MjpegCamera(StreamCamera):
         super().__init__(
             url, name, clock, timeout=timeout, latency=latency, frozen_after=frozen_after, on_image=on_image
         )
-        parts = urlsplit(url)
         try:
+            parts = urlsplit(url)
             port = parts.port or 80
         except ValueError as error:
-            raise UsageError(f"camera {name}: {url} has no valid port; expected http://HOST:PORT/path") from error
+            raise UsageError(f"camera {name}: {url} is no valid address; expected http://HOST:PORT/path") from error
         plain = url.isascii() and not any(c.isspace() for c in url) and "@" not in parts.netloc
         if parts.scheme != "http" or not parts.hostname or not plain:
             raise UsageError(f"camera {name}: expected http://HOST:PORT/path (no user name), got {url!r}")

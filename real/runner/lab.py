@@ -4,6 +4,7 @@ SI units, unless the name of a key ends in `_deg` or `_mm`. `gelflow.real.runner
 """
 
 import dataclasses
+import ipaddress
 import math
 import os
 import re
@@ -26,6 +27,7 @@ from gelflow.real.limits import LAB_RANGES, LIMITS, MOCK_TIME_SCALE, Range
 from gelflow.real.web_services.client import WebServicesClient
 
 FORMAT = 1
+_MOST_LINES = 100  # of markers in one direction
 Vector = tuple[float, float, float]
 
 
@@ -87,6 +89,11 @@ class ArmSettings:
 
     def __post_init__(self) -> None:
         _check_ranges(self, "arm.")
+        try:
+            ipaddress.ip_address(self.robot or "0.0.0.0")
+        except ValueError:
+            text = f"robot must be the IP address of the controller, or empty, got {self.robot!r}"
+            raise UsageError(text) from None
         if self.web_services:
             WebServicesClient(self.web_services)  # checks the address
 
@@ -116,7 +123,8 @@ class CameraSettings:
         _require(bool(known), text)
         turned = self.rotation_deg in (0, 90, 180, 270)
         _require(turned, f"rotation_deg must be 0, 90, 180 or 270, got {self.rotation_deg}")
-        _require(self.rows >= 3 and self.cols >= 3, f"rows and cols must be at least 3, got {self.rows}, {self.cols}")
+        lines = min(self.rows, self.cols) >= 3 and max(self.rows, self.cols) <= _MOST_LINES
+        _require(lines, f"rows and cols must be 3 to {_MOST_LINES}, got {self.rows}, {self.cols}")
         one = bool(self.calibration) != bool(self.pixels_per_mm)
         _require(one, "give either calibration, a file of gelflow calibrate-camera, or pixels_per_mm")
         _check_ranges(self, "cameras.", skip="pixels_per_mm" if self.calibration else "")
@@ -173,10 +181,10 @@ def _toml(value: Any) -> str:
 def _camera_identity(source: str) -> str:
     """A text that is equal for two sources of the same camera."""
     if not source.startswith("uvc:"):
-        url = urlsplit(source)
         try:
+            url = urlsplit(source)
             return f"{url.hostname}:{url.port or 80}{url.path or '/'}?{url.query}"
-        except ValueError:  # an invalid port, which the driver refuses
+        except ValueError:  # an invalid address, which the driver refuses
             return source
     device = source.removeprefix("uvc:")
     # Links such as those in /dev/v4l/by-id name a device that has another name too.

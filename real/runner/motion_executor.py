@@ -96,9 +96,8 @@ class MotionExecutor:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
         """Hold; after an exception also stop and latch."""
-        self._goal = None
         with contextlib.suppress(GelflowError):
-            self._arm.hold()
+            self.hold()
         self._ending.set()
         self._thread.join(2.0)
         if isinstance(error, Exception) and self.failure is None:
@@ -314,10 +313,9 @@ class MotionExecutor:
         """Hold within this cycle, then stop. The gripper is not opened and no power is cut, so the part stays held."""
         known = isinstance(error, GelflowError)
         self.failure = error if isinstance(error, GelflowError) else PeerError(f"{type(error).__name__}: {error}")
-        self._goal = None
         reason = str(self.failure)
         for action in (
-            self._arm.hold,
+            self.hold,
             lambda: self.supervisor.latch(reason),
             lambda: self._arm.stop(reason),
             self._log,

@@ -9,6 +9,7 @@ from gelflow.perception.frames import CameraMount, decode_image
 from gelflow.perception.mount_check import start_at_rest, visible_text
 from gelflow.real.runner.cell import Cell
 from gelflow.real.runner.supervisor import Supervisor, not_ready_reason
+from gelflow.real.wsg.checks import may_hold_part
 
 _COMPARED_IMAGES = 3  # consecutive images of each camera
 _FOLLOW_TIMEOUT = 3.0  # for the controller to follow references [s]
@@ -24,7 +25,7 @@ class PreflightItem:
 
 
 def run_preflight(cell: Cell, supervisor: Supervisor) -> list[PreflightItem]:
-    """Check cameras, arm and gripper. Homes the gripper outwards if the lab file allows it; nothing else moves.
+    """Check cameras, arm and gripper. Only when all checks pass, homes the gripper outwards if the lab file allows it.
 
     Returns all results. Raises SafetyError, which names every failed check.
     """
@@ -38,6 +39,8 @@ def run_preflight(cell: Cell, supervisor: Supervisor) -> list[PreflightItem]:
         ("gripper", lambda: _gripper(cell)),
     ]
     items = [_result(name, check) for name, check in checks]
+    if all(item.good for item in items) and not cell.dry_run and not cell.gripper.state().referenced:
+        items[-1] = _result("gripper", lambda: _homed(cell))
     cell.recorder.event("preflight", {item.name: {"good": item.good, "text": item.text} for item in items})
     if failed := [f"{item.name}: {item.text}" for item in items if not item.good]:
         raise SafetyError(f"preflight failed: {'; '.join(failed)}")
@@ -111,13 +114,17 @@ def _gripper(cell: Cell) -> str:
     state = cell.gripper.state()
     if state.fault:
         raise PeerError(f"it reports {state.fault}; inspect it and acknowledge the fault")
-    if not state.referenced and cell.lab.gripper.home_at_start:
-        if cell.dry_run:
-            return "not homed: a run homes it outwards first"
-        cell.gripper.home()
-        state = cell.gripper.state()
-    if not state.referenced:
+    if may_hold_part(state, grasped=False):
+        raise SafetyError(
+            f"a part may be held ({state.grasp}, {state.force:.1f} N); hold it and release it with: gelflow robot open"
+        )
+    if state.referenced:
+        return f"homed, {state.grasp}, {1e3 * state.width:.1f} mm open"
+    if not cell.lab.gripper.home_at_start:
         raise SafetyError("it is not homed: home it outwards, or set home_at_start in the lab file")
-    if state.grasp == "holding":
-        raise SafetyError("it holds a part; remove the part")
-    return f"homed, {state.grasp}, {1e3 * state.width:.1f} mm open"
+    return "not homed: a run homes it outwards after these checks"
+
+
+def _homed(cell: Cell) -> str:
+    cell.gripper.home()
+    return _gripper(cell)

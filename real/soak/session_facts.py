@@ -16,7 +16,7 @@ from gelflow.session.reader import SessionReader
 from gelflow.session.recovery import recover
 
 _SETTLING = 0.2  # after a latch the reference may return to the arm's pose for this time [s]
-_LATCHES = ("latched", "hold latched")  # values of the event "state"
+_LATCHED = "latched"  # value of the event "state"
 _STOPS = ("stopped", "arm stopped")  # names of events
 
 
@@ -78,7 +78,7 @@ def _facts(path: Path, lab: Lab, readable: str) -> SessionFacts:
 
 
 def _is_latch(name: str, values: dict[str, Any]) -> bool:
-    return name == "stopped" or (name == "state" and values.get("state") in _LATCHES)
+    return name == "stopped" or (name == "state" and values.get("state") == _LATCHED)
 
 
 def _motion_after(latched_at: float, applied: list[tuple[float, Pose]]) -> float:

@@ -55,11 +55,11 @@ class WebServicesClient:
     """
 
     def __init__(self, address: str, *, timeout: float = 2.0) -> None:
-        parts = urlsplit(address)
         try:
+            parts = urlsplit(address)
             valid = parts.scheme == "http" and bool(parts.hostname) and (parts.port is None or parts.port > 0)
         except ValueError:
-            valid = False
+            parts, valid = urlsplit(""), False
         if not valid or parts.path not in ("", "/") or parts.query or "@" in parts.netloc or not address.isascii():
             raise UsageError(f"web services: expected http://HOST or http://HOST:PORT, got {address!r}")
         self.address = f"http://{parts.netloc}"

@@ -197,13 +197,17 @@ class WsgGripper:
     def move(self, *, width: float, speed: float) -> None:
         """Move the empty fingers to `width` [m] at `speed` [m/s]; returns when they have arrived.
 
-        Raises SafetyError outside the limits or while a part is held, UsageError when the motion takes longer than the
+        Raises SafetyError outside the limits or while a part may be held, UsageError when it takes longer than the
         time-out, PeerRefused when the fingers are blocked, PeerTimeout and PeerError as every command.
         """
         state = self._ready("move")
         check_limits(self._limits, width=width, speed=speed)
         if self._holds(state):
             raise SafetyError("move refused: a part is held; release it instead")
+        if may_hold_part(state, grasped=False):
+            raise SafetyError(
+                f"move refused: a part may be held ({state.grasp}, {state.force:.1f} N); release it instead"
+            )
         check_duration(state, width, speed, self._config.move_timeout)
         packet = codec.pre_position(width, speed)
         self._move("move", {"width": width, "speed": speed}, packet, self._config.move_timeout)

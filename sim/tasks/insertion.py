@@ -146,6 +146,7 @@ class InsertionAttempts:
         self._u: Array = np.zeros((num_envs, self.scene.nu))
         self._grasp = {name: np.repeat(getattr(self.sim, name)[:1], num_envs, axis=0) for name in _GRASP_STATE}
         self._end = {name: np.repeat(getattr(self.sim, name)[:1], num_envs, axis=0) for name in _STATE}
+        self._not_grasped: Mask = np.zeros(num_envs, bool)  # the closing of the gripper could not be simulated
         self._grasp_shear: Array = np.zeros((num_envs, self.scene.num_markers, 2))
         self._trajectory: Trajectory | None = None
 
@@ -197,6 +198,7 @@ class InsertionAttempts:
         u[:n, self._arm_u[2]] += weight / self._param("arm_z.kp")[rows]  # gravity compensation
         sim.q[:n] = q
         sim.step(u, self._settle_steps, active=np.arange(sim.num_envs) < n)
+        self._not_grasped[rows] = sim.status[:n] != 0
         self._u[rows] = u[:n]
         for name, values in self._grasp.items():
             values[rows] = getattr(sim, name)[:n]
@@ -224,7 +226,7 @@ class InsertionAttempts:
                 # The markers of the start are those of the closed grasp.
                 shear[k, part] = trajectory.tactile[k, :n, :, :2] if step else self._grasp_shear[rows[part]]
             height[part], inserted[part] = self._outcome(trajectory.q[-1, :n])
-            failed[part] = trajectory.status[:n] != 0
+            failed[part] = (trajectory.status[:n] != 0) | self._not_grasped[rows[part]]
             stopped = trajectory.stopped_at[:n]
             self._last_step[rows[part]] = np.where(stopped < 0, self._steps, stopped)
             inserted[part] &= ~failed[part] & (stopped < 0)
@@ -239,7 +241,7 @@ class InsertionAttempts:
     def _in_contact(self, rows: Rows, change: Array) -> Mask:
         """Whether the shear along a finger shows contact, after its `change` (n, markers, 2) [N] in a descent."""
         along = change[..., 0].reshape(len(rows), len(PADS), -1).mean(2)
-        return np.asarray(along.max(1) > _CONTACT_SHARE * self.stop_shear[rows])
+        return np.asarray(np.abs(along).max(1) > _CONTACT_SHARE * self.stop_shear[rows])
 
     def _simulate(self, rows: Rows, jitter: Array, steps: list[int]) -> Trajectory:
         """The descent of the grippers `rows`, read after `steps`."""

@@ -146,8 +146,9 @@ class Randomization:
     def replace(self, **changes: "Distribution | float | tuple[float, float]") -> "Randomization":
         """The table with other distributions of some quantities.
 
-        A number fixes the quantity; a pair (low, high) sets the range and keeps the kind of distribution. The other
-        quantities keep their samples, unless a quantity changes to or from `Fixed`. Raises UsageError for an unknown
+        A number fixes the quantity; a pair (low, high) sets the range and keeps the kind of distribution, except that a
+        normal one becomes uniform. The other quantities keep their random values, unless a quantity changes to or from
+        `Fixed`. Raises UsageError for an unknown
         quantity or an invalid range.
         """
         quantities = dict(self.quantities)

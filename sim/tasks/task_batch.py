@@ -103,6 +103,8 @@ class TaskBatch(ABC):
         SimulationError when every draw ends at once.
         """
         rows = self._mask(which)
+        if not rows.any():
+            return
         self._reset(rows, rng, options or {})
         self._started |= rows
         if options or keep_ended:
@@ -133,6 +135,8 @@ class TaskBatch(ABC):
         rows = self.all if active is None else self._mask(active)
         if not self._started[rows].all():
             raise UsageError(f"{self.description.name}: reset the environments before their first step")
+        if not rows.any():
+            return
         self._step(np.clip(wanted, -1, 1), rng, rows)
 
     def _record(self, which: Mask, drawn: Mapping[str, Array], table: Randomization, **units: str) -> None:

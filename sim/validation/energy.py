@@ -17,7 +17,6 @@ from gelflow.sim import _core
 from gelflow.sim.arguments import check_type
 from gelflow.sim.scene import CONTACT_PARAMS, Scene
 from gelflow.sim.simulator import Simulator
-from gelflow.sim.validation.gradient_check import quaternion_joints
 
 Array = NDArray[np.float64]
 
@@ -71,7 +70,7 @@ class EnergyGauge:
             raise UsageError("the simulator must be one of the scene of the gauge")
         kinetic = 0.5 * np.einsum("ni,nij,nj->n", sim.v, sim.mass_matrix(), sim.v)
         contact, friction = self._stored(sim, *self.points(sim))
-        springs, limits = _joints(sim)
+        springs, limits = joint_energies(sim)
         return Energy(kinetic, _gravity(sim), contact, friction, springs, limits)
 
     def points(self, sim: Simulator) -> tuple[Array, Array]:
@@ -151,16 +150,22 @@ def _gravity(sim: Simulator) -> Array:
     return result
 
 
-def _joints(sim: Simulator) -> tuple[Array, Array]:
+def joint_energies(sim: Simulator) -> tuple[Array, Array]:
+    """Energies [J] of the springs of all joints, and of the springs at their limits, (N,) each."""
     springs, limits = np.zeros(sim.num_envs), np.zeros(sim.num_envs)
-    quaternions = {v for _, v in quaternion_joints(sim.model)}
-    for name, q, v in zip(sim.model.joint_names, sim.model.joint_q, sim.model.joint_v, strict=True):
-        if v in quaternions or v + 3 in quaternions:  # ball or free joint
+    ends = [*sim.model.joint_q[1:], sim.model.nq]
+
+    def param(joint: str, key: str) -> Array:
+        qualified = f"joint:{joint}.{key}"  # where elements of different kinds have one name
+        return sim.param(qualified if qualified in sim.param_index else f"{joint}.{key}")
+
+    for name, q, end in zip(sim.model.joint_names, sim.model.joint_q, ends, strict=True):
+        if end - q > 1:  # a ball or free joint has no spring and no limits
             continue
         value = sim.q[:, q]
-        springs += 0.5 * sim.param(f"{name}.stiffness") * (value - sim.param(f"{name}.springref")) ** 2
-        beyond = np.maximum(value - sim.param(f"{name}.upper"), 0) + np.maximum(sim.param(f"{name}.lower") - value, 0)
-        limits += 0.5 * sim.param(f"{name}.limit_stiffness") * beyond**2
+        springs += 0.5 * param(name, "stiffness") * (value - param(name, "springref")) ** 2
+        beyond = np.maximum(value - param(name, "upper"), 0) + np.maximum(param(name, "lower") - value, 0)
+        limits += 0.5 * param(name, "limit_stiffness") * beyond**2
     return springs, limits
 
 

@@ -17,7 +17,7 @@ from gelflow.real.runner.motion_executor import MotionExecutor
 from gelflow.real.runner.phases import Phase
 from gelflow.real.runner.touch.grasp_check import GraspCheck, check_release
 from gelflow.real.runner.touch.guarded_motion import Contact, GuardedMotion, along_finger, downward, in_any_direction
-from gelflow.real.runner.touch.observer import TactileObserver, TactileReading
+from gelflow.real.runner.touch.observer import MarkersUnreadable, TactileObserver, TactileReading
 from gelflow.real.runner.touch.slip import SlipMonitor
 from gelflow.session.recorder import SessionRecorder
 from gelflow.task import InsertionTask
@@ -189,6 +189,8 @@ class HeldPart:
         self._slip += slip.distance
         if self._slip > self._lab.part.max_slip:
             raise PartSlipped(f"the part slipped in the grip by up to {1e3 * self._slip:.1f} mm; hand it over again")
+        if not observer.readings:
+            raise MarkersUnreadable("the descent ended before a pair of images was readable")
         return Descent(contact is not None, slip.slipped, observer.readings[-1])
 
     def lower(self, planar_pose: PlanarPose) -> TactileReading | None:

@@ -29,6 +29,8 @@ from gelflow.real.wsg.checks import holds_part
 from gelflow.session.records import Decision
 from gelflow.task import InsertionTask
 
+_STATE_TIME = 0.2  # after a refused grasp, until the gripper's state is that after it [s]
+_LEVEL = 0.5e-3  # largest distance below the hand-over at which the gripper is not raised first [m]
 _HAND_OVER_TIME = 3.0  # after the grasp, for the operator to let the part go [s]
 
 
@@ -69,6 +71,12 @@ class InsertionRunner:
                 f"the task descends by {deep:g} mm, descent.max_depth of the lab file allows {allowed:g} mm; raise it, "
                 "or train with a smaller [descent] depth in the part file"
             )
+        if task.success_height - lab.part.insert_to <= lab.hole.height_error:
+            low, height, error = (1e3 * v for v in (lab.part.insert_to, task.success_height, lab.hole.height_error))
+            raise SafetyError(
+                f"contact at the rim and at the floor cannot be distinguished: part.insert_to is {low:g} mm, the part "
+                f"is inserted below {height:g} mm, and hole.height_error is {error:g} mm; reduce one of them"
+            )
         self._motions = policy.motions if isinstance(policy, PlanPolicy) else ()
         check_motions(self._motions, lab, task)
         self._cell, self._policy, self._task = cell, policy, task
@@ -93,7 +101,14 @@ class InsertionRunner:
             outcome = self._end_lost(number, part, str(error))
         except NotGrasped as error:
             outcome = str(error)
-            self._retreat_empty()
+            self._motion.wait(_STATE_TIME)
+            if holds_part(self._cell.gripper.state(), grasped=True):  # too wide, for example: it blocked the fingers
+                self._release_to_operator(number)
+            else:
+                self._retreat_empty()
+        except PartSlipped as error:  # at the hand-over, before the first attempt
+            outcome = str(error)
+            self._release_to_operator(number)
         self._motion.supervisor.phases.enter(Phase.IDLE)
         result = Insertion(number, outcome, self._planar_pose, self._clock.now() - start, tuple(attempts))
         tries = len(attempts)
@@ -163,6 +178,7 @@ class InsertionRunner:
         lab = self._lab
         self._motion.supervisor.phases.enter(Phase.LOAD)
         self._motion.expect_part(False)
+        self._rise()
         self._motion.move(self.pose((0.0, 0.0, 0.0), lab.part.load_height))
         if abs(self._cell.gripper.state().width - lab.gripper.open_width) > 1e-3:
             self._cell.gripper.move(width=lab.gripper.open_width, speed=lab.gripper.speed)
@@ -341,7 +357,16 @@ class InsertionRunner:
         """Without a held part: move up, with the fingers unchanged."""
         self._motion.expect_part(False)
         self._motion.supervisor.phases.enter(Phase.RETREAT)
-        self._motion.move(self.pose(self._planar_pose, self._lab.part.load_height))
+        self._rise()
+
+    def _rise(self) -> None:
+        """Without a held part: straight up to the height of the hand-over, unless the gripper is higher.
+
+        The fingers may be around a part in the hole.
+        """
+        x, y, yaw, height = self._motion.supervisor.hole_coordinates(self._motion.pose())
+        if height < self._lab.part.load_height - _LEVEL:
+            self._motion.move(self.pose((x, y, yaw), self._lab.part.load_height))
 
 
 class NotGrasped(PeerRefused):

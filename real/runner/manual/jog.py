@@ -230,6 +230,7 @@ def _move(session: Session, devices: _Devices, motion: MotionExecutor, step: _St
     phases.enter(Phase.RETREAT if step.upward else sideways)
     thresholds = nominal_thresholds(lab.descent)
     threshold = thresholds.stuck if step.upward else thresholds.stop
+    speed = min(speed, guard.speed_towards(step.target))
     contact = guard.move(step.target, threshold=threshold, measure=in_any_direction, speed=speed)
     if contact is not None:
         raise SafetyError(

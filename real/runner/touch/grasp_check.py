@@ -113,8 +113,8 @@ def check_release(held: Sequence[TactileReading], released: Sequence[TactileRead
     for side, size in zip(_SIDES, change, strict=False):
         if size < _NOISE_FACTOR * check.noise:
             raise TouchImplausible(
-                f"{side} camera: the pad shows no change at the release ({size:.4f} mm); the result is not believed: "
-                "check that this camera is live, then inspect the part"
+                f"{side} camera: the pad shows no change at the release ({size:.4f} mm), so the part does not count as "
+                "inserted: check that this camera is live, then inspect the part"
             )
 
 

@@ -78,12 +78,15 @@ class Batch {
   void add_readings_vjp(const Trajectory<T>& r, const TrajectoryCotangent<T>& cotangent, double* grad_q,
                         double* grad_v);
   void check_state(const T* positions, const T* velocities, const std::uint8_t* active) const;  // (N, nq), (N, nv)
+  void check_history(const T* histories, const std::uint8_t* active) const;                     // (N, nh)
+  void check_anchors(const V3<T>* values, const std::uint8_t* is_set, const std::uint8_t* active) const;  // (N, na)
   void check_params(const std::uint8_t* active);
+  void check_all(const std::uint8_t* active);  // state, history and parameters of the batch
   void check_controls(const T* u, int rows, const std::uint8_t* active) const;
   std::vector<StepMemory<T>> memory_;             // one per thread
   std::vector<ReadingMemory<T>> reading_memory_;  // one per thread
   std::vector<int> active_;                       // active environments of the present call
-  std::vector<T> right_params_;                   // (N, params): the last ones that were checked
+  std::vector<T> checked_params_;                 // (N, params): the last ones that were found valid
   std::vector<T> q_rounding_;                     // (N, nq) in single precision: rounding residual of q (StateView)
   std::unique_ptr<Batch<double>> double_batch_;   // in single precision: computes the gradients
   std::vector<NonzeroMarkers> nonzero_;           // per environment, of `readings`

@@ -30,7 +30,7 @@ Batch<T>::Batch(std::shared_ptr<const Model> m, int environments, int threads)
     std::copy(model->param_defaults.begin(), model->param_defaults.end(),
               params.begin() + static_cast<std::ptrdiff_t>(e * model->param_names.size()));
   }
-  right_params_ = params;
+  checked_params_ = params;
   reset(nullptr);
 }
 
@@ -106,12 +106,40 @@ void Batch<T>::check_state(const T* positions, const T* velocities, const std::u
   }
 }
 
+template <class T>
+void Batch<T>::check_history(const T* histories, const std::uint8_t* active) const {
+  const auto nh = static_cast<std::size_t>(model->nh);
+  for (std::size_t i = 0; i < n * nh; ++i) {
+    if (is_finite(histories[i]) || (active != nullptr && active[i / nh] == 0)) continue;
+    throw std::invalid_argument("history[" + std::to_string(i / nh) + ", " + std::to_string(i % nh) +
+                                "] is not finite");
+  }
+}
+
+// Of a rollout only: for a single step or a reading this takes too long, and a step with such an anchor fails.
+template <class T>
+void Batch<T>::check_anchors(const V3<T>* values, const std::uint8_t* is_set, const std::uint8_t* active) const {
+  const auto na = static_cast<std::size_t>(model->na);
+  for (std::size_t i = 0; i < n * na; ++i) {
+    if (is_set[i] == 0 || is_finite(values[i].sum()) || (active != nullptr && active[i / na] == 0)) continue;
+    throw std::invalid_argument("anchors[" + std::to_string(i / na) + ", " + std::to_string(i % na) +
+                                "] is not finite");
+  }
+}
+
+template <class T>
+void Batch<T>::check_all(const std::uint8_t* active) {
+  check_state(q.data(), v.data(), active);
+  check_history(history.data(), active);
+  check_params(active);
+}
+
 // Compares parameters with those that were checked before, which costs less than a check.
 template <class T>
 void Batch<T>::check_params(const std::uint8_t* active) {
   const std::size_t width = model->param_names.size();
   for (int e = 0; checks_params && e < n; ++e) {
-    T* const right = right_params_.data() + e * width;
+    T* const right = checked_params_.data() + e * width;
     if (std::memcmp(right, params_of(e), width * sizeof(T)) == 0 || (active != nullptr && active[e] == 0)) continue;
     const std::string wrong = wrong_parameter(*model, params_of(e));
     if (!wrong.empty()) throw std::invalid_argument("environment " + std::to_string(e) + ": " + wrong);
@@ -123,8 +151,7 @@ template <class T>
 void Batch<T>::step(const Controls<T>& u, int steps, const std::uint8_t* active) {
   if (steps < 0) throw std::invalid_argument("steps must not be negative, got " + std::to_string(steps));
   check_controls(u.u, u.shared ? 1 : n, u.shared ? nullptr : active);
-  check_state(q.data(), v.data(), active);
-  check_params(active);
+  check_all(active);
   for_active(active, [&](int e, int thread) {
     follow_leaders<T>(*model, state(e));
     for (int i = 0; i < steps && status[e] == 0 && !interruption_->check(thread); ++i) {
@@ -155,8 +182,7 @@ void position_difference(const Model& m, const T* q0, const T* q1, T* out) {
 template <class T>
 void Batch<T>::error_estimate(const Controls<T>& u, T* out, std::int32_t* failures) {
   check_controls(u.u, u.shared ? 1 : n, nullptr);
-  check_state(q.data(), v.data(), nullptr);
-  check_params(nullptr);
+  check_all(nullptr);
   const Model& m = *model;
   for_all([&](int e, int thread) {
     StepMemory<T>& memory = memory_[thread];
@@ -190,6 +216,7 @@ void Batch<T>::tactile(T* out, const std::uint8_t* active) {
 
 template <class T>
 void Batch<T>::reduced_tactile(const TactileReduction& reduction, T* out, const std::uint8_t* active) {
+  check_all(active);
   for_active(active, [&](int e, int thread) {
     ReadingMemory<T>& memory = reading_memory_[thread];
     memory.forces.resize(static_cast<std::size_t>(model->num_markers) * 3);
@@ -209,6 +236,7 @@ void Batch<T>::update_readings(const std::uint8_t* active) {
 
 template <class T>
 void Batch<T>::read(T* out, NonzeroMarkers* nonzero, const std::uint8_t* active) {
+  check_all(active);
   for_active(active, [&](int e, int thread) {
     read_one(e, thread, out + static_cast<std::size_t>(e) * model->num_markers * 3,
              nonzero == nullptr ? nullptr : nonzero + e);
@@ -225,6 +253,7 @@ void Batch<T>::read_one(int e, int thread, T* out, NonzeroMarkers* nonzero) {
 
 template <class T>
 void Batch<T>::wrenches(T* out) {
+  check_all(nullptr);
   for_all([&](int e, int thread) {
     kinematics(e, memory_[thread].work);
     contact_wrenches<T>(*model, params_of(e), state(e).anchors, state(e).anchored, memory_[thread].work,
@@ -232,20 +261,32 @@ void Batch<T>::wrenches(T* out) {
   });
 }
 
+// Without the arc correction, which belongs to a step.
 template <class T>
 void Batch<T>::contact_forces(T* out) {
+  check_all(nullptr);
   for_all([&](int e, int thread) {
     Workspace<T>& w = memory_[thread].work;
     kinematics(e, w);
     w.residual.setZero();
-    const StepStart<T> start{T(1), nullptr, nullptr, nullptr, nullptr, state(e).anchors, state(e).anchored, nullptr};
-    subtract_contact_forces<false, T>(*model, params_of(e), start, CacheState::stale, false, w);
+    for (std::size_t i = 0; i < model->contacts.size(); ++i) {
+      const Contact& contact = model->contacts[i];
+      const PointSet& set = model->point_sets[contact.points];
+      const PairFrame<T> frame = pair_frame<T>(params_of(e), set.mount, model->shapes[contact.shape], w);
+      const ContactSettings<T> settings =
+          contact_settings<T>(*model, contact, params_of(e), state(e).anchors, state(e).anchored);
+      ContactSums<T> sums;
+      find_candidate_points<T>(frame, set.cloud, settings, CacheState::stale, w.candidates[i]);
+      if (!sum_forces<false, T>(frame, w.candidates[i], settings, sums)) continue;
+      subtract_impulses<T>(contact.pair, T(1), wrench_in_world<T>(frame, sums.wrench()), false, w);
+    }
     for (int k = 0; k < model->nv; ++k) out[static_cast<std::size_t>(e) * model->nv + k] = -w.residual[k];
   });
 }
 
 template <class T>
 void Batch<T>::poses(T* out) {
+  check_all(nullptr);
   Workspace<T>& w = memory_[0].work;
   for (int e = 0; e < n; ++e) {
     kinematics(e, w);
@@ -262,6 +303,7 @@ void Batch<T>::poses(T* out) {
 
 template <class T>
 void Batch<T>::mass_matrix(T* out) {
+  check_all(nullptr);
   Workspace<T>& w = memory_[0].work;
   const std::size_t size = static_cast<std::size_t>(model->nv) * model->nv;
   for (int e = 0; e < n; ++e, out += size) {
@@ -287,6 +329,7 @@ void Batch<T>::mass_matrix(T* out) {
 
 template <class T>
 void Batch<T>::bias(T* out) {
+  check_all(nullptr);
   Workspace<T>& w = memory_[0].work;
   for (int e = 0; e < n; ++e, out += model->nv) {
     kinematics(e, w);

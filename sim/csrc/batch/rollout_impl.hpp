@@ -49,6 +49,8 @@ template <class T>
 void Batch<T>::rollout(const Trajectory<T>& r, const TouchStop* stop) {
   check_controls(r.u, r.steps * n, r.active);
   check_state(r.q, r.v, r.active);
+  check_anchors(reinterpret_cast<const V3<T>*>(r.anchors), r.anchored, r.active);
+  check_history(r.history, r.active);
   check_params(r.active);
   for (int e = 0; e < n; ++e) {
     r.status[e] = 0;
@@ -65,7 +67,8 @@ void Batch<T>::contact_modes(const Trajectory<T>& r, std::uint64_t* out) {
   std::fill_n(out, r.row(r.steps, 0), 0);
   for_all([&](int env, int thread) {
     const std::size_t e = env;
-    for (int t = 0; t < r.steps_taken(e) && !interruption_->check(thread); ++t) {
+    const int taken = std::min(r.steps, r.steps_taken(e));  // a part of a trajectory may end before its stop
+    for (int t = 0; t < taken && !interruption_->check(thread); ++t) {
       const bool read = std::find(r.read_after, r.read_after + r.reads, t + 1) != r.read_after + r.reads;
       const StateView<T> before = r.state(m, t, e), after = r.state(m, t + 1, e);
       ModeHash hash;

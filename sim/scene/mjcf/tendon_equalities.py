@@ -49,7 +49,7 @@ def read_tendon_equalities(
         polynomial = Polynomial(model.eq_data[e, :1])
         if second != _NO_TENDON:
             others = tendon_terms(model, second)
-            polynomial = Polynomial(np.trim_zeros(model.eq_data[e, :5], "b"))
+            polynomial = Polynomial(model.eq_data[e, :5]).trim()
             if polynomial.degree() > 1:
                 added.append(_curved(model, name, terms, others, polynomial))
                 continue

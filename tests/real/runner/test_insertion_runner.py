@@ -119,6 +119,58 @@ def test_part_that_moves_in_the_grip_is_raised_and_handed_back(
     assert robot.cell.truth()["part"] is None or robot.cell.truth()["part"]["phase"] != "gripped"
 
 
+def test_a_part_that_blocks_the_fingers_is_handed_back(robot: MockRobot, tmp_path: Path) -> None:
+    """It is wider than stated, so the grasp is refused; the next insertion begins with open fingers."""
+    lab = lab_for(robot)
+    lab = replace(lab, gripper=replace(lab.gripper, part_width=lab.gripper.part_width - 6e-3))
+    results = run_insertions(plan_for(robot, tmp_path, OraclePolicy(robot), lab=lab, insertions=2))
+    assert len(results) == 2 and all("AXIS_BLOCKED" in result.outcome for result in results)
+    assert robot.cell.gripper_state()[0] == pytest.approx(lab.gripper.open_width, abs=1e-3)
+
+
+def test_a_part_that_moves_at_the_hand_over_is_handed_back(
+    robot: MockRobot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    measured, at_grasp = robot.cell.gripper_state, [0.0]
+
+    def with_wider_grip() -> tuple[float, float, float]:
+        width, speed, force = measured()
+        part = robot.cell.truth()["part"]
+        if part is None or part["phase"] != "gripped":
+            return width, speed, force
+        at_grasp[0] += 0.02e-3  # the operator pulls
+        return width + min(at_grasp[0], 0.7e-3), speed, force
+
+    monkeypatch.setattr(robot.cell, "gripper_state", with_wider_grip)
+    (result,) = run_insertions(plan_for(robot, tmp_path, OraclePolicy(robot)))
+    assert "the part moved" in result.outcome and not result.attempts
+    assert robot.cell.truth()["part"] is None or robot.cell.truth()["part"]["phase"] != "gripped"
+
+
+class Absent:
+    """An operator who ends the run when a part is asked for."""
+
+    def present(self, number: int) -> None:
+        raise SafetyError("nobody is here")
+
+    def take(self, number: int) -> None:
+        raise SafetyError("nobody is here")
+
+
+def test_a_run_begins_with_a_motion_straight_up(robot: MockRobot, tmp_path: Path) -> None:
+    """The fingers may be around a part in the hole when a run ends."""
+    start, _ = robot.config.cell.start_tool()
+    lab = lab_for(robot)
+    x, y, z = lab.hole.position
+    lab = replace(lab, hole=replace(lab.hole, position=(x + 3e-3, y, z)), part=replace(lab.part, load_height=0.045))
+    with pytest.raises(SafetyError, match="nobody is here"):
+        run_insertions(plan_for(robot, tmp_path, OraclePolicy(robot), lab=lab, operator=lambda motion: Absent()))
+    moves = [values["position"] for name, values in events(tmp_path / "session.mcap") if name == "move"]
+    up, sideways = np.array(moves) - start
+    assert up[2] > 1e-3 and np.abs(up[:2]).max() < 1e-4
+    assert sideways[0] == pytest.approx(3e-3, abs=1e-4) and sideways[2] == pytest.approx(up[2], abs=1e-4)
+
+
 class InterruptedGripper:
     """A gripper whose state calls `on_read` once: another thread runs between two steps of the caller."""
 

@@ -57,6 +57,27 @@ def test_preflight_reports_all_failed_checks_without_motion(robot: MockRobot, tm
     assert robot.cell.gripper_state()[0] == pytest.approx(0.06, abs=1e-4)
 
 
+def test_the_fingers_move_only_after_all_checks(robot: MockRobot, tmp_path: Path) -> None:
+    lab = lab_for(robot)
+    lab = replace(lab, hole=replace(lab.hole, position=(0.374, 0.10, 0.05)))  # the gripper is outside its workspace
+    assert lab.gripper.home_at_start
+    with pytest.raises(SafetyError, match="preflight failed: pose: target refused"):
+        run_insertions(plan_for(robot, tmp_path, OraclePolicy(robot), lab=lab))
+    assert robot.cell.gripper_state()[0] == pytest.approx(0.06, abs=1e-4)
+
+
+def test_a_clamped_part_is_refused_in_every_state_of_the_gripper(
+    robot: MockRobot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After an acknowledged FAST STOP the device is idle, and the fingers still press on the part."""
+    measured = robot.cell.gripper_state
+    monkeypatch.setattr(robot.cell, "gripper_state", lambda: (*measured()[:2], 8.0))
+    with pytest.raises(SafetyError, match=r"a part may be held \(idle, 8\.0 N\); hold it and release it with"):
+        run_insertions(plan_for(robot, tmp_path, OraclePolicy(robot)))
+    assert robot.arm.report.largest_step < 1e-9
+    assert robot.cell.gripper_state()[0] == pytest.approx(0.06, abs=1e-4)
+
+
 def lab_with_address(robot_lab: Lab, **changes: str) -> Lab:
     lab = robot_lab
     if "gripper" in changes:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from gelflow.sim import _core
 from gelflow.sim.scene import FRICTION_LAWS, load_scene, scene_names
 from gelflow.sim.simulator import Simulator
-from gelflow.sim.validation.energy import EnergyGauge, actuator_forces
+from gelflow.sim.validation.energy import EnergyGauge, actuator_forces, joint_energies
 from gelflow.sim.validation.reference_motions import reference_motion
 from gelflow.sim.validation.thrown_bodies import GRAVITY, KINDS, MASS, SIZE, Kind, ThrownBody, throw_bodies
 
@@ -110,6 +110,21 @@ def test_energy_terms_equal_their_formulas() -> None:
     sim.step(np.zeros(0))
     sim.q[0, 0] += 2e-5  # the same strain at all nine points
     np.testing.assert_allclose(gauge.read(sim).friction[0], 9 * 0.5 * 1e3 * 4e-10, rtol=1e-6)
+
+
+def test_springs_of_joints_before_a_ball_joint_have_energy() -> None:
+    """Three slides and a ball joint: the first slide has the velocity number that the ball's has less three."""
+    spec = _core.ModelSpec()
+    body = spec.add_body(_core.BodyDef(name="body", mass=0.1, inertia=[1e-4, 1e-4, 1e-4, 0, 0, 0]))
+    for axis in range(3):
+        spec.add_joint(
+            _core.JointDef(name=f"slide{axis}", body=body, type="slide", axis=np.eye(3)[axis], stiffness=10.0)
+        )
+    spec.add_joint(_core.JointDef(name="ball", body=body, type="ball"))
+    sim = Simulator(_core.Model(spec))
+    sim.q[0, :3] = 0.1
+    springs, _ = joint_energies(sim)
+    assert springs[0] == pytest.approx(3 * 0.5 * 10 * 0.1**2)
 
 
 # Largest gain of a step beyond the motors' work, relative to their total work. BDF2 has errors above its dissipation.

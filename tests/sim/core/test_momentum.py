@@ -13,6 +13,7 @@ from gelflow.sim import _core
 from gelflow.sim.scene import load_scene, scene_names
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.validation.reference_motions import reference_motion
+from gelflow.sim.validation.thrown_bodies import SIZE, ThrownBody
 
 Array = NDArray[np.float64]
 
@@ -125,6 +126,19 @@ def test_generalized_contact_forces_cancel_to_rounding(name: str, law: str) -> N
     print(f"{name}, {law}: pairs cancel to {worst:.0e}")
     assert touched > 1e-3
     assert worst < 1e-13
+
+
+@pytest.mark.parametrize("integrator", ["bdf1", "bdf2"])
+def test_generalized_contact_forces_do_not_depend_on_the_spin(integrator: str) -> None:
+    """Without damping and friction; the arc correction belongs to a step, not to the forces of a state."""
+    numbers = {"kn": 2e3, "kt": 0.0, "mu": 0.0, "kd": 0.0, "ks": 0.0}
+    throw = ThrownBody("box", "viscous", "hunt-crossley", 1e-3, numbers, integrator=integrator)
+    sim = Simulator(_core.Model(throw.model_spec()), num_envs=2)
+    sim.q[:, 0], sim.q[:, 2] = -10, 0.6 * SIZE - 1e-3
+    sim.v[1, 3:6] = 5.0, -3.0, 8.0
+    forces = sim.contact_forces()
+    assert forces[0, 2] > 1e-3
+    np.testing.assert_allclose(forces[1], forces[0], rtol=1e-12, atol=1e-15)
 
 
 @pytest.mark.parametrize("centred", [True, False])

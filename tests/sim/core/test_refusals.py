@@ -19,7 +19,7 @@ from gelflow.sim.simulator import Simulator
 from gelflow.sim.tasks.insertion import insertion_scene
 from gelflow.sim.tasks.randomization import Randomization
 from gelflow.sim.tasks.registry import make_task
-from gelflow.sim.torch_layer import TorchState, torch_rollout, torch_state
+from gelflow.sim.torch_layer import TorchState, torch_rollout, torch_site_poses, torch_state
 from gelflow.sim.trajectory import TouchStop
 from gelflow.sim.validation.energy import EnergyGauge
 
@@ -50,6 +50,14 @@ CALLS: list[tuple[Callable[[Any], Any], str]] = [
     (lambda s: s.rollout(U, read_after=3), "read_after must be a sequence of integers, got 3"),
     (lambda s: s.rollout(U, anchored=-1), "anchored must be numeric"),
     (lambda s: s.rollout(U + 1j), "u must be real, got complex128"),
+    (
+        lambda s: torch_rollout(s, replace(torch_state(s), anchored=torch.zeros(1)), torch.from_numpy(U)),
+        "state.anchored must be a CPU tensor of torch.uint8, got torch.float32",
+    ),
+    (
+        lambda s: torch_site_poses(s, torch.zeros((2, s.model.nq), dtype=torch.int64)),
+        "q must be a CPU tensor of torch.float32 or torch.float64, got torch.int64",
+    ),
     (lambda s: s.scene.q(3), "no joint 3"),
     (lambda s: load_scene(3), "scene must be a name or a path, got int"),  # type: ignore[arg-type]
     (lambda s: load_scene("pushing", preset=[1]), r".*no preset \[1\]"),  # type: ignore[arg-type]
@@ -197,6 +205,40 @@ def test_wrong_parameter(name: str, value: float, message: str, precision: Any) 
     values = torch.tensor([float(right), value], dtype=torch_state(sim).q.dtype)
     with pytest.raises(UsageError, match=match if np.isfinite(value) else f"^{name} is not finite"):
         torch_rollout(sim, torch_state(sim), torch.zeros((2, 2, 6), dtype=values.dtype), params={name: values})
+
+
+@pytest.mark.parametrize("precision", ["double", "single"])
+def test_memory_of_the_state_that_is_not_finite(precision: Any) -> None:
+    sim = Simulator(
+        load_scene("pushing", friction="elastic", overrides={"integrator": "bdf2"}), num_envs=2, precision=precision
+    )
+    anchors, history = np.zeros_like(sim.anchors), np.zeros_like(sim.history)
+    anchors[1, 3, 0], history[1, 2] = np.nan, np.inf
+    anchored = np.ones_like(sim.anchored)
+    with pytest.raises(UsageError, match=r"^anchors\[1, 3\] is not finite"):
+        sim.rollout(U, anchors=anchors, anchored=anchored)
+    sim.rollout(U, anchors=anchors)  # none of them is set
+    with pytest.raises(UsageError, match=r"^history\[1, 2\] is not finite"):
+        sim.rollout(U, history=history)
+    sim.history[:] = history
+    with pytest.raises(UsageError, match=r"^history\[1, 2\] is not finite"):
+        sim.step(np.zeros(6))
+    sim.step(np.zeros(6), active=[True, False])
+
+
+@pytest.mark.parametrize("read", ["tactile", "wrenches", "contact_forces", "poses", "mass_matrix", "bias"])
+def test_readings_of_a_wrong_state_are_refused(read: str) -> None:
+    """No force where a comparison with NaN is false, and no NaN."""
+    sim = Simulator(load_scene("pushing"), num_envs=2)
+    getattr(sim, read)()
+    before = sim.q[1, 0]
+    sim.q[1, 0] = np.nan
+    with pytest.raises(UsageError, match=r"^q\[1, 0\] is not finite"):
+        getattr(sim, read)()
+    sim.q[1, 0] = before
+    sim.param("pad_box.kn")[0] = np.nan
+    with pytest.raises(UsageError, match=r"^environment 0: parameter 'pad_box\.kn' must be a number"):
+        getattr(sim, read)()
 
 
 NOT_FINITE = [

@@ -147,3 +147,22 @@ def test_a_scene_without_pads_has_no_touch_stop() -> None:
     sim = Simulator(dataclasses.replace(load_scene("pushing"), pads=()))
     with pytest.raises(UsageError, match="a touch stop needs a scene with pads"):
         sim.rollout(np.zeros((3, 1, sim.model.nu)), stop=TouchStop(1.0))
+
+
+def test_contact_modes_of_a_part_of_a_trajectory(scene: Scene) -> None:
+    """It may end before the environments stopped."""
+    sim, u = lowered(scene)
+    run = sim.rollout(u, read_after=READS, stop=TouchStop(threshold(scene), reference_step=REFERENCE))
+    steps = int(run.stopped_at.max()) - 2
+    part = dataclasses.replace(
+        run,
+        **{name: getattr(run, name)[: steps + 1].copy() for name in ("q", "v", "anchors", "anchored", "history")},
+        u=run.u[:steps].copy(),
+        halvings=run.halvings[:steps].copy(),
+        tactile=run.tactile[:1].copy(),
+        read_after=run.read_after[:1],
+    )
+    modes = sim.contact_modes(part)
+    assert modes.shape == (steps, ENVS)
+    before_reading = [k for k in range(steps) if k + 1 not in READS]
+    np.testing.assert_array_equal(modes[before_reading], sim.contact_modes(run)[:steps][before_reading])

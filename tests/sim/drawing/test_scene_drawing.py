@@ -32,6 +32,12 @@ def test_weight_of_a_ball_acts_upwards_at_its_lowest_point() -> None:
     np.testing.assert_allclose(contact.point[2], ball[2] - float(sim.param("ball.size.x")[0]), atol=1e-6)
 
 
+def test_scenes_with_colliding_pads_are_drawn() -> None:
+    sim = gs.Simulator(gs.load_scene("insertion", overrides={"pads.*.collides": True}))
+    assert len(sim.wrenches()[0]) > len(gs.load_scene("insertion").contacts)
+    assert len(scene_drawing(sim).pads) == 2
+
+
 def test_geometries_have_the_size_and_place_of_their_environment() -> None:
     sim = gs.Simulator(gs.load_scene("insertion"), num_envs=2)
     sim.param("part.size.x")[1] = 0.01

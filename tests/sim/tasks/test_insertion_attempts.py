@@ -127,6 +127,16 @@ def test_flow_map_shows_the_location_of_the_contact() -> None:
     np.testing.assert_allclose(left[:, 1], -right[:, 1, :, ::-1], atol=0.01)
 
 
+@pytest.mark.parametrize("sign", [1, -1])
+def test_contact_at_the_end_of_a_descent_has_either_direction(sign: int) -> None:
+    """The rim pushes the part up, against the direction of the markers' x axis."""
+    attempts, _ = attempted(poses((0, 4, 0)))
+    change = np.zeros((1, attempts.scene.num_markers, 2))
+    for share, contact in ((0.2, False), (0.5, True)):
+        change[..., 0] = sign * share * attempts.stop_shear[0]
+        assert attempts._in_contact(np.array([0]), change).tolist() == [contact]
+
+
 def test_flow_map_is_independent_of_the_descent_speed() -> None:
     """Frames are selected by depth: a robot descends ten times more slowly and observes the same map."""
     cases = poses((3, 0, 0), (0, 4, 0), (2, 4, 8))

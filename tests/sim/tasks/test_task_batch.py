@@ -12,7 +12,7 @@ from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 
 from gelflow.errors import SimulationError, UsageError
-from gelflow.sim import load_scene
+from gelflow.sim import load_scene, make_task
 from gelflow.sim.tasks.control_task import ControlDescription, ControlTask, adapt_step
 from gelflow.sim.tasks.gripper.attempt_task import AttemptTask
 from gelflow.sim.tasks.gymnasium_envs import TaskEnv, TaskVectorEnv
@@ -207,3 +207,13 @@ def test_descriptions_of_tasks() -> None:
         InsertionTask.from_json({"name": "line"})
     assert INSERTION.digest() == "cceede46a985d44f"
     assert PUBLISHED_INSERTION.digest() == "028d8d8be55f0e5f"
+
+
+@pytest.mark.parametrize("name", ["insertion", "grasp", "pushing", "cap", "rolling"])
+def test_no_environment_may_be_chosen(name: str) -> None:
+    task, rng, none = make_task(name, 2), np.random.default_rng(0), np.zeros(2, dtype=bool)
+    task.reset(task.all, rng)
+    before = task.observation.copy()
+    task.reset(none, rng)
+    task.step(np.zeros((2, *task.action_space.shape)), rng, active=none)
+    np.testing.assert_array_equal(task.observation, before)

@@ -16,7 +16,7 @@ _PREFLIGHT = "tests/real/runner/test_preflight.py"
 
 _BEFORE_MOTION = (
     Promise(
-        "preflight", "nothing moves before all devices pass their checks: gripper in FAST STOP",
+        "preflight", "the arm does not move before all devices pass their checks: gripper in FAST STOP",
         "motion of the arm", 1.0, "µm",
         refused_run(refusals.gripper_with_fault, "FAST"),
         (f"{_PREFLIGHT}::test_preflight_reports_all_failed_checks_without_motion",),

@@ -66,7 +66,9 @@ def _status(args: argparse.Namespace, output: Output) -> int:
     from gelflow.real.runner.lab_file import load_lab
     from gelflow.real.runner.manual.status import read_status
 
-    devices = read_status(load_lab(args.lab))
+    lab = load_lab(args.lab)
+    with interruptible():  # the gripper takes a disconnect without announcement for a fault
+        devices = read_status(lab)
     table = Table(title="State of the robot", show_header=False, box=None)
     for name, values in devices.items():
         table.add_row(yes_or_no(values["ready"]), name, values["text"])
