@@ -193,6 +193,12 @@ class UvcCamera(StreamCamera):
         self._device = device if isinstance(device, int) else str(device)
         self._size = size
         self._capture: Any = None
+        self._damaged = 0
+
+    @property
+    def damaged(self) -> int:
+        """Number of damaged images that were skipped since the stream was opened."""
+        return self._damaged
 
     def _connect(self) -> None:
         import cv2  # a stream over HTTP does not need OpenCV
@@ -220,19 +226,21 @@ class UvcCamera(StreamCamera):
                 read, pixels = capture.read()
                 if not read:
                     raise PeerError(f"camera {self.name}: {self.source} sent no image; is it plugged in? reconnect")
-                yield ReceivedImage(*self._encode(pixels))
+                if (encoded := self._encode(pixels)) is None:
+                    self._damaged += 1
+                else:
+                    yield ReceivedImage(*encoded)
         finally:
             capture.release()
 
-    def _encode(self, pixels: Any) -> tuple[bytes, str]:
+    def _encode(self, pixels: Any) -> tuple[bytes, str] | None:
+        """The image and its format; None for a damaged JPEG, as cameras send when a stream begins."""
         import cv2
 
         if 1 in pixels.shape[:2]:  # one row of bytes: the JPEG itself
             data = pixels.tobytes()
             end = data.rfind(b"\xff\xd9")  # the buffer is longer than the image
-            if data.startswith(b"\xff\xd8") and end > 0:
-                return data[: end + 2], "jpeg"
-            raise PeerError(f"camera {self.name}: {self.source} sent {len(data)} bytes that are not a JPEG")
+            return (data[: end + 2], "jpeg") if data.startswith(b"\xff\xd8") and end > 0 else None
         done, png = cv2.imencode(".png", pixels)
         if not done:
             raise PeerError(f"camera {self.name}: {self.source} sent pixels of the invalid shape {pixels.shape}")

@@ -96,7 +96,7 @@ class StreamCamera(ABC):
         with self._changed:
             self._failure = None
             self._newest = None
-            self._rejected = 0
+            self._rejected, self._since, self._frozen = 0, None, False
         self._camera_clock = CameraClock()
         self._thread = threading.Thread(
             target=self._receive, args=(self._closing,), name=f"camera {self.name}", daemon=True

@@ -116,6 +116,7 @@ def dry_run(plan: RunPlan) -> DryRun:
     """Connect, preflight, check the first targets, read the pads and evaluate the policy, without motion."""
     with _recording(plan, dry_run=True) as recorder, open_cell(plan.lab, recorder, dry_run=True) as cell:
         supervisor, motion = create_motion(cell)
+        before = motion.pose()  # now: a controller whose messages are not answered soon ends EGM
         items = run_preflight(cell, supervisor)
         runner = InsertionRunner(
             cell, plan.policy, task=plan.task, motion=motion, operator=WaitingOperator(motion, plan.lab.part.load_wait)
@@ -127,7 +128,7 @@ def dry_run(plan: RunPlan) -> DryRun:
         observation = flow_map([reading.frame], observer.reference.frame, grid=plan.task.grid)
         plan.policy.reset()
         correction = np.asarray(plan.policy.act(observation), dtype=float)
-        return DryRun(items, runner.check_plan(supervisor), observation, correction)
+        return DryRun(items, runner.check_plan(supervisor, before), observation, correction)
 
 
 def create_motion(cell: Cell) -> tuple[Supervisor, MotionExecutor]:

@@ -120,6 +120,8 @@ class WsgLink:
             while True:
                 reply = self._take(inbox, packet, deadline - self._clock.now() if pending else self._reply_timeout)
                 if reply.status == Status.CMD_PENDING:
+                    if pending and self._clock.now() > deadline:
+                        raise self._no_answer(packet)
                     pending = True
                 elif pending or reply.status != Status.SUCCESS:
                     return reply, pending
@@ -164,15 +166,19 @@ class WsgLink:
                     raise self._failure_copy()
                 left = end - time.monotonic()
                 if left <= 0:
-                    raise PeerTimeout(
-                        f"the gripper at {self.address} did not answer {Command(packet.id).name} in time: "
-                        f"is it on, and not used by another program?"
-                    )
+                    raise self._no_answer(packet)
                 self._condition.wait(left)
             return inbox.popleft()
 
+    def _no_answer(self, packet: Packet) -> PeerTimeout:
+        return PeerTimeout(
+            f"the gripper at {self.address} did not answer {Command(packet.id).name} in time: "
+            f"is it on, and not used by another program?"
+        )
+
     def _failure_copy(self) -> GelflowError:
-        assert self._failure is not None
+        if self._failure is None:  # the link broke just now, in another thread
+            return PeerError(f"the link to the gripper at {self.address} is broken")
         return type(self._failure)(str(self._failure))  # a separate exception for each thread that raises it
 
     def _fail(self, error: GelflowError) -> None:

@@ -170,11 +170,12 @@ class HeldPart:
                 raise SafetyError(f"the gripper is deeper than its descent of {1e3 * depth_below:g} mm")
             return slip.add(depth, reading.shear)
 
+        target = self._pose(planar_pose, self.start_height - depth_below)
         contact = self._guard.move(
-            self._pose(planar_pose, self.start_height - depth_below),
+            target,
             threshold=stop,
             measure=along_finger,
-            speed=self._lab.descent.speed,
+            speed=min(self._lab.descent.speed, self._guard.speed_towards(target)),
             within=_AT_DEPTH,
             deadline=self._deadline,
             on_reading=on_reading,

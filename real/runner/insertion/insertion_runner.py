@@ -147,11 +147,9 @@ class InsertionRunner:
         self._release_to_operator(number)
         return evidence
 
-    def check_plan(self, supervisor: Supervisor) -> list[str]:
-        """Check the first targets of a run, each relative to the one before; returns them as text. Nothing moves."""
+    def check_plan(self, supervisor: Supervisor, before: Pose) -> list[str]:
+        """Check the first targets of a run from the pose `before`; returns them as text. Nothing moves."""
         lab, task = self._lab, self._task
-        state = self._cell.arm.state()
-        before = lab.gripper_pose(state.position, state.quaternion)
         turn_speed = math.radians(lab.arm.max_turn_speed_deg)
         taught: PlanarPose = (0.0, 0.0, 0.0)
         checked = []

@@ -112,7 +112,8 @@ def _wait_for_end(*, attached: bool) -> None:
 
     if attached:
         threading.Thread(target=wait_for_end_of_input, daemon=True).start()
-    before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
+    signals = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = {number: signal.signal(number, end) for number in signals}
     try:
         while not ending.wait(0.5):
             pass

@@ -99,8 +99,10 @@ def _run_plans(args: argparse.Namespace) -> int:
     """Run the plans that the folder does not contain yet, then print all counts."""
     from gelflow.cli.soak_case import SoakCase
     from gelflow.real.soak.ledger import Ledger
+    from gelflow.sim.scene import load_scene
 
-    check_at_least(args, plans=1, seed=0, jobs=1)
+    check_at_least(args, plans=1, seed=0, jobs=1, jitter=0, factor=1)
+    load_scene("insertion", preset=args.preset)  # raises for an unknown preset
     only = None if args.only is None else _seed(args.only)
     output = Output(args.json)
     ledger = Ledger(args.out / "soak.jsonl")
