@@ -338,7 +338,8 @@ class Simulator(StateArrays):
     def _along_time(self, name: str, start: ArrayLike | None, steps: int, out: Trajectory | None) -> NDArray[Any]:
         """A part of the state over a rollout, in a new array or that of `out`, with its initial value."""
         present = getattr(self, name)
-        array = np.zeros((steps + 1, *present.shape), present.dtype) if out is None else getattr(out, name)
+        shape = (steps + 1, *present.shape)
+        array = np.zeros(shape, present.dtype) if out is None else out.reused(name, shape, present.dtype)
         fill(name, array[0], present if start is None else start)  # before: it may be the end of `out`
         if out is not None and name == "anchors":
             array[1:] = 0  # the core writes only the anchors that are set

@@ -83,6 +83,14 @@ class Trajectory:
                 f"out must have tactile readings of shape {tactile_shape} (see reduction), got {self.tactile.shape}"
             )
 
+    def reused(self, name: str, shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:
+        """An array of the states, for another rollout. Raises UsageError when it has another shape or precision."""
+        array: NDArray[Any] = getattr(self, name)
+        if array.shape != shape or array.dtype != dtype:
+            expected = f"{np.dtype(dtype)} {shape}"
+            raise UsageError(f"out is of another model: its {name} is {array.dtype} {array.shape}, not {expected}")
+        return array
+
 
 @dataclass(frozen=True)
 class TrajectoryGradient:

@@ -17,7 +17,7 @@ _FRAMED = 50  # drawings of a film that set the camera
 
 
 def record_rollout(sim: Simulator, controls: Array, frames: Sequence[int]) -> list[SceneDrawing]:
-    """Take the steps of `controls` (steps, nu) and draw environment 0 after each number of steps in `frames`.
+    """Take the steps of `controls` (steps, nu) or (steps, N, nu); draw environment 0 after each number in `frames`.
 
     The last controls are held when `frames` go beyond them. Raises SimulationError when a step fails.
     """

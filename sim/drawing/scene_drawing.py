@@ -90,7 +90,7 @@ def scene_drawing(sim: Simulator, env: int = 0) -> SceneDrawing:
 
 
 def drawn_geoms(sim: Simulator, env: int) -> tuple[GeomDef, ...]:
-    """The geometries of the model file and the shapes of the scene, with the sizes and poses of an environment."""
+    """The geometries of the model file and the shapes of the scene, with the sizes and positions of an environment."""
     scene: Scene = sim.scene
     shapes = {shape.name: shape for shape in scene.shapes}
     files = {geom.name: geom for geom in scene.geoms}

@@ -145,14 +145,6 @@ class CapRotation(ControlTask):
         }
         self.metrics = {"largest rate [rad/s]": np.zeros(num_envs), "turned without touch [°]": np.zeros(num_envs)}
 
-    def __getstate__(self) -> dict[str, Any]:
-        """For copies and pickles: all but the reduction of the core, which follows from the scene."""
-        return {name: value for name, value in vars(self).items() if name != "_reduction"}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(state)
-        self._reduction = _fingertip_rows(self.scene)
-
     def _find_indices(self) -> None:
         """Indices, limits and sizes of the scene's elements."""
         scene = self.scene

@@ -114,6 +114,9 @@ class TaskBatch(ABC):
             if not ended.any():
                 return
             self._reset(ended, rng, {})
+        ended = rows & (self.terminated | self.truncated)
+        if not ended.any():
+            return
         succeeded = int((ended & self.info["success"]).sum())
         raise SimulationError(
             f"{self.description.name}: no valid start in {_MAX_RESET_ROUNDS} rounds: every episode ended at once; in "

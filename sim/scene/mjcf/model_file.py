@@ -87,10 +87,10 @@ def _compiled(spec: Any, model: Any, path: Path, *, urdf: bool) -> CompiledModel
     if key is not None:
         other = np.ones(free.nq, bool)
         for body in mocap:
-            place = slice(q := free.jnt_qposadr[free.body_jntadr[body.id]], q + 7)
+            pose = slice(q := free.jnt_qposadr[free.body_jntadr[body.id]], q + 7)
             which = model.body_mocapid[body.id]
-            q0[place] = [*model.key_mpos[key].reshape(-1, 3)[which], *model.key_mquat[key].reshape(-1, 4)[which]]
-            other[place] = False
+            q0[pose] = [*model.key_mpos[key].reshape(-1, 3)[which], *model.key_mquat[key].reshape(-1, 4)[which]]
+            other[pose] = False
         q0[other] = model.key_qpos[key]
     return CompiledModel(free, urdf, q0, controls, tuple(names[body.id] for body in mocap))
 

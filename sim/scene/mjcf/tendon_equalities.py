@@ -23,12 +23,12 @@ _NO_TENDON = -1
 
 
 def unsupported_equality(model: Any, e: int) -> bool:
-    """Whether an equality of tendons is not modelled: of spatial tendons, or curved and of more than two joints."""
+    """Whether an equality of tendons is not modelled: of spatial tendons, or nonlinear and of more than two joints."""
     tendons = [t for t in (int(model.eq_obj1id[e]), int(model.eq_obj2id[e])) if t != _NO_TENDON]
     if not all(is_fixed(model, t) for t in tendons):
         return True
-    curved = len(tendons) == 2 and np.any(model.eq_data[e, 2:5])
-    return bool(curved and any(len(tendon_terms(model, t)) > 1 for t in tendons))
+    nonlinear = len(tendons) == 2 and np.any(model.eq_data[e, 2:5])
+    return bool(nonlinear and any(len(tendon_terms(model, t)) > 1 for t in tendons))
 
 
 def read_tendon_equalities(
@@ -51,7 +51,7 @@ def read_tendon_equalities(
             others = tendon_terms(model, second)
             polynomial = Polynomial(model.eq_data[e, :5]).trim()
             if polynomial.degree() > 1:
-                added.append(_curved(model, name, terms, others, polynomial))
+                added.append(_nonlinear(model, name, terms, others, polynomial))
                 continue
             slope = float(polynomial.deriv()(0.0))
             start -= slope * _length(model, others)
@@ -83,7 +83,7 @@ def _linear(model: Any, name: str, terms: dict[int, float], length: float, follo
     return CouplingDef(name, joint, leader, (length / a, -b / a), joint_kind(model, joint))
 
 
-def _curved(
+def _nonlinear(
     model: Any, name: str, terms: dict[int, float], others: dict[int, float], polynomial: Polynomial
 ) -> CouplingDef:
     """c₁ q₁ = L₁⁰ + P(c₂ q₂ − L₂⁰) of one joint on each side."""

@@ -374,18 +374,6 @@ def test_results_are_written_to_given_arrays(insertion: Scene) -> None:
         sim.rollout(u, read_after=(3,), out=other)
 
 
-def test_a_rollout_continues_from_the_end_of_the_arrays_that_it_reuses() -> None:
-    scene = load_scene("insertion", friction="elastic")
-    u, sim = controls(scene), started(scene, list(range(ENVS)))
-    run = sim.rollout(u)
-    assert run.anchored[-1].any()
-    ends = ("q", "v", "anchors", "anchored", "history")
-    right = sim.rollout(u, **{name: getattr(run, name)[-1].copy() for name in ends})
-    again = sim.rollout(u, **{name: getattr(run, name)[-1] for name in ends}, out=run)
-    for name in ends:
-        np.testing.assert_array_equal(getattr(again, name), getattr(right, name))
-
-
 def test_controls_of_any_memory_layout(insertion: Scene) -> None:
     u = controls(insertion)[0]
     one, two, three = (started(insertion, list(range(ENVS))) for _ in range(3))
