@@ -185,7 +185,7 @@ class OverlayWriter:
             self._begin()
         if self._video is not None:
             self._video.release()
-            self._check_complete()
+            check_complete(self._path, self._written)
 
     def _begin(self) -> None:
         waiting, self._waiting = self._waiting, []
@@ -210,17 +210,18 @@ class OverlayWriter:
             self._video.write(picture)
             self._written += 1
 
-    def _check_complete(self) -> None:
-        """Raise PeerError when the file does not announce its pictures: OpenCV reports no error of a full disk."""
-        try:
-            count = image_source(str(self._path)).count() or 0
-        except (PeerError, UsageError):
-            count = 0
-        if count < 0.98 * self._written - 2:
-            raise PeerError(f"the video {self._path} is incomplete; is the disk full?")
-
     def _draw(self, step: TrackedImage) -> NDArray[np.uint8]:
         return overlay(step, magnify=self._magnify, forces=self._forces)
+
+
+def check_complete(path: Path, written: int) -> None:
+    """Raise PeerError when a video does not announce its pictures: OpenCV reports no error of a full disk."""
+    try:
+        count = image_source(str(path)).count() or 0
+    except (PeerError, UsageError):
+        count = 0
+    if count < 0.98 * written - 2:
+        raise PeerError(f"the video {path} is incomplete; is the disk full?")
 
 
 def video_rate(rate: float) -> float:

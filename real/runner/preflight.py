@@ -43,7 +43,7 @@ def run_preflight(cell: Cell, supervisor: Supervisor) -> list[PreflightItem]:
     # The gripper is homed last. A controller whose messages are not answered, as in a dry run, soon ends EGM.
     checks = [*robot, *cameras] if cell.dry_run else [*cameras, *robot]
     items = [_result(name, check) for name, check in checks]
-    if all(item.good for item in items) and not cell.dry_run and not cell.gripper.state().referenced:
+    if all(item.good for item in items) and not cell.dry_run:
         items[-1] = _result("gripper", lambda: _homed(cell))
     cell.recorder.event("preflight", {item.name: {"good": item.good, "text": item.text} for item in items})
     if failed := [f"{item.name}: {item.text}" for item in items if not item.good]:
@@ -130,5 +130,6 @@ def _gripper(cell: Cell) -> str:
 
 
 def _homed(cell: Cell) -> str:
-    cell.gripper.home()
+    if not cell.gripper.state().referenced:
+        cell.gripper.home()
     return _gripper(cell)

@@ -1,13 +1,16 @@
 """`gelflow render-scene`: films and pictures of shipped scenes and of bare model files."""
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+from gelflow.cli.commands.pictures.render_scene import _write_film
 from gelflow.cli.main import main
+from gelflow.errors import SimulationError
 from gelflow.sim.scene import load_scene
 
 MODEL = """
@@ -67,3 +70,16 @@ def test_controls_of_a_wrong_width_are_refused(tmp_path: Path, capsys: pytest.Ca
     np.save(tmp_path / "u.npy", np.zeros((3, 99)))
     assert main(["render-scene", "pushing", "--controls", str(tmp_path / "u.npy")]) == 2
     assert "must be (steps," in capsys.readouterr().err
+
+
+def test_an_error_while_drawing_leaves_the_earlier_film(tmp_path: Path) -> None:
+    film = tmp_path / "film.mp4"
+    film.write_bytes(b"earlier")
+
+    def pictures() -> Iterator[np.ndarray]:
+        yield np.zeros((48, 64, 3), dtype=np.uint8)
+        raise SimulationError("a step failed")
+
+    with pytest.raises(SimulationError):
+        _write_film(film, pictures(), (64, 48), 25.0, "mp4v")
+    assert film.read_bytes() == b"earlier" and [path.name for path in tmp_path.iterdir()] == ["film.mp4"]

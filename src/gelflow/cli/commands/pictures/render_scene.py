@@ -117,16 +117,26 @@ def _frames(args: argparse.Namespace, steps: int, step: float, *, film: bool) ->
 
 
 def _write_film(path: Path, pictures: Any, size: tuple[int, int], fps: float, codec: str) -> None:
+    """Write a film by way of a file beside it: an error while drawing leaves an earlier film as it is."""
     import cv2
 
+    from gelflow.perception.output.writers import check_complete, video_rate
+
     pictures = iter(pictures)
-    first = next(pictures)  # before the file is created: an error of the drawing leaves no empty film
-    video = cv2.VideoWriter(str(path.absolute()), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*codec), fps, size)
-    if not video.isOpened():
-        raise UsageError(f"cannot write the film {path}; is its folder writable?")
-    for picture in itertools.chain([first], pictures):
-        video.write(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
-    video.release()
+    first = next(pictures)  # before the file is created
+    partial, count = path.with_name(f"{path.stem}.part{path.suffix}").absolute(), 0
+    try:
+        video = cv2.VideoWriter(str(partial), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*codec), video_rate(fps), size)
+        if not video.isOpened():
+            raise UsageError(f"cannot write the film {path}; is its folder writable?")
+        for picture in itertools.chain([first], pictures):
+            video.write(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+            count += 1
+        video.release()
+        check_complete(partial, count)
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
 
 
 def _write_picture(path: Path, picture: NDArray[np.uint8]) -> None:
