@@ -49,7 +49,7 @@ PHASES: Mapping[Phase, PhaseRule] = MappingProxyType(
         Phase.LOAD: PhaseRule(
             "without a part to the hand-over; grasp; comparison of the pads before and after it",
             moves=True,
-            following=(Phase.APPROACH, Phase.RETREAT, Phase.RELEASE),
+            following=(Phase.APPROACH, Phase.RETREAT),
         ),
         Phase.APPROACH: PhaseRule(
             "with the part down to the start height",

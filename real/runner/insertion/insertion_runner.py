@@ -342,8 +342,11 @@ class InsertionRunner:
 
     def _release_to_operator(self, number: int) -> None:
         """Release the part to the operator."""
+        phases = self._motion.supervisor.phases
+        if phases.phase is Phase.LOAD:  # at the height of the hand-over already
+            phases.enter(Phase.RETREAT)
         self._operator.take(number)
-        self._motion.supervisor.phases.enter(Phase.RELEASE)
+        phases.enter(Phase.RELEASE)
         self._open()
 
     def _open(self) -> None:
