@@ -101,7 +101,7 @@ def test_insertion_that_the_pads_do_not_show_is_not_believed(robot: MockRobot, t
     wait_for(lambda: lowered_to(robot, 24.4e-3), 280, during=finish)
     present = [robot.cell.marker_displacement(finger).copy() for finger in (0, 1)]
     robot.cell.marker_displacement = lambda finger: present[finger]  # type: ignore[method-assign]
-    with pytest.raises(GelflowError, match=r"no change at the release .* is not believed"):
+    with pytest.raises(GelflowError, match=r"no change at the release .* does not count as inserted"):
         finish()
     assert not recorded(tmp_path, "insertion ended")
 
