@@ -170,12 +170,11 @@ class HeldPart:
                 raise SafetyError(f"the gripper is deeper than its descent of {1e3 * depth_below:g} mm")
             return slip.add(depth, reading.shear)
 
-        target = self._pose(planar_pose, self.start_height - depth_below)
         contact = self._guard.move(
-            target,
+            self._pose(planar_pose, self.start_height - depth_below),
             threshold=stop,
             measure=along_finger,
-            speed=min(self._lab.descent.speed, self._guard.speed_towards(target)),
+            speed=self._lab.descent.speed,
             within=_AT_DEPTH,
             deadline=self._deadline,
             on_reading=on_reading,

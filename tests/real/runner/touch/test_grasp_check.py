@@ -86,5 +86,7 @@ def test_release_without_a_change_of_the_pads_is_not_believed() -> None:
     held = readings(WEIGHT, seed=1)
     check = check_grasp(FREE, held, DescentSettings())
     check_release(held, readings(np.zeros((2, 2)), seed=2), check)
-    with pytest.raises(TouchImplausible, match=r"right camera: the pad shows no change at the release .* does not count as inserted"):
+    with pytest.raises(
+        TouchImplausible, match=r"right camera: the pad shows no change at the release .* does not count as inserted"
+    ):
         check_release(held, readings([[0.0, 0.0], WEIGHT[1]], seed=2), check)
