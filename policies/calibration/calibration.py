@@ -65,7 +65,7 @@ class Calibration:
     """Result of `calibrate`. Flow maps and noise are in `unit`."""
 
     estimates: tuple[Estimate, ...]
-    correlated: tuple[tuple[str, str, float], ...]  # pairs of which only the combination is determined
+    correlated: tuple[tuple[str, str, float], ...]  # two parameters and their correlation, if large
     fitted: FlowMaps
     held_out: FlowMaps | None  # None: there was one insertion only
     held_out_residual: float | None  # root mean square of their whitened residuals after the calibration

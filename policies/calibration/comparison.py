@@ -52,10 +52,12 @@ def error(recorded: Array, simulated: Array, used: NDArray[np.bool_]) -> float:
     return float(np.sqrt(((simulated - recorded)[:, used] ** 2).mean()))
 
 
-def noisy_markers_text(used: NDArray[np.bool_]) -> str:
+def unused_markers_text(used: NDArray[np.bool_]) -> str:
     """One line about markers that are not compared; empty if all are."""
-    left = int((~used).sum())
-    return f"{left} of {len(used)} markers are too noisy, or not in the images, and are not compared" if left else ""
+    unused = int((~used).sum())
+    return (
+        f"{unused} of {len(used)} markers are too noisy, or not in the images, and are not compared" if unused else ""
+    )
 
 
 def _length(flow: Array) -> Array:

@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 _ROUNDS = 20  # of one ensemble, at most
 _LATER_ROUNDS = 10
 _SPREADS = (0.5, 0.3)  # of the ensembles around the best member, relative to the prior
-_FIRST = 1.7  # first values of the parameters, at most [sd]
+_FIRST = 1.7  # largest initial value of a whitened parameter
 _MODEL_ERROR = 0.04  # that residuals allow for, relative to the flow maps
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from gelflow.observation import Grid
 from gelflow.policies.calibration.calibrated_randomization import calibrated_randomization
 from gelflow.policies.calibration.calibration import ALLOWED_ERROR, FORMAT, Calibration, Estimate, FlowMaps
-from gelflow.policies.calibration.comparison import noisy_markers_text
+from gelflow.policies.calibration.comparison import unused_markers_text
 from gelflow.policies.calibration.flow_picture import draw_flow_maps
 from gelflow.session.records import to_plain
 
@@ -139,7 +139,7 @@ def error_lines(result: Calibration) -> list[str]:
             f"{len(maps.recorded)} {kind} flow maps: error {before:.3g} {result.unit} before, "
             f"{after:.3g} {result.unit} after calibration; noise {result.noise:.3g} {result.unit}"
         )
-    if text := noisy_markers_text(result.fitted.used):
+    if text := unused_markers_text(result.fitted.used):
         lines.append(text)
     if not result.height_plausible:
         lines.append(

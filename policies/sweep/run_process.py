@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import fcntl
 import json
 import os
 import platform
@@ -18,6 +17,7 @@ from typing import IO, Any
 from gelflow.errors import UsageError
 from gelflow.policies.sweep import launcher
 from gelflow.policies.sweep.run import WRONG_INPUT, Run, RunRecord, read_record, write_record
+from gelflow.policies.training.folder import try_lock
 
 _POLL = 0.1  # interval of looking at the process [s, wall]
 _EXIT_LIMIT = 10.0  # time from SIGTERM to SIGKILL [s, wall]
@@ -104,13 +104,7 @@ class RunProcess:
                 raise UsageError(f"{self._machine} has no folder {folder}; all machines of a sweep must share it")
         if self._lock is None:
             self._lock = run.lock.open("ab")
-        try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return False
-        except OSError:  # a file system without locks
-            return True
-        return True
+        return try_lock(self._lock)
 
     def _start(self, record: RunRecord) -> None:
         run = self._run

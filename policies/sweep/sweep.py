@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import fcntl
 import os
 import platform
 import shutil
@@ -13,6 +12,7 @@ from pathlib import Path
 from gelflow.errors import UsageError
 from gelflow.policies.sweep.engines.engine import Engine
 from gelflow.policies.sweep.run import Run, RunRecord, read_record, write_record
+from gelflow.policies.training.folder import try_lock
 
 Report = Callable[[Run, RunRecord, bool], None]  # a run that ended, its record, and whether it is started again
 
@@ -30,13 +30,9 @@ def sweep_folder(folder: Path, grid_file: Path) -> Iterator[None]:
     except OSError as error:
         raise UsageError(f"cannot write into {folder}: {error.strerror}") from error
     with lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
+        if not try_lock(lock):
             lock.seek(0)
-            raise UsageError(f"another sweep uses {folder}: {lock.read().strip()}") from None
-        except OSError:  # a file system without locks
-            pass
+            raise UsageError(f"another sweep uses {folder}: {lock.read().strip()}")
         lock.truncate(0)
         lock.write(f"process {os.getpid()} on {platform.node()}\n")
         lock.flush()

@@ -1,7 +1,9 @@
-"""Folders of trainings and evaluations."""
+"""Folders of trainings, evaluations and sweeps, and locks of their files between processes."""
 
+import fcntl
 import tempfile
 from pathlib import Path
+from typing import IO, Any
 
 from gelflow.errors import UsageError
 
@@ -14,3 +16,17 @@ def create_folder(folder: Path) -> None:
             pass
     except OSError as error:
         raise UsageError(f"cannot write into {folder}: {error.strerror}") from error
+
+
+def try_lock(file: IO[Any]) -> bool:
+    """Lock an open file until it is closed; False where another process has the lock.
+
+    On a file system without locks the result is True.
+    """
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:  # a file system without locks
+        pass
+    return True

@@ -5,7 +5,6 @@ The folder holds `run.json` (configuration, command, versions), `progress.csv`, 
 """
 
 import contextlib
-import fcntl
 import json
 import platform
 import time
@@ -23,6 +22,7 @@ from gelflow.policies.checkpoint import replace_file, save_checkpoint, task_diff
 from gelflow.policies.episodes import evaluate_task
 from gelflow.policies.evaluation import EvaluationResult
 from gelflow.policies.training import progress_curve
+from gelflow.policies.training.folder import try_lock
 from gelflow.policies.training.learner import Learner
 from gelflow.policies.training.progress_log import ProgressLog
 from gelflow.policies.training.state import load_state, save_state
@@ -267,12 +267,8 @@ def locked(folder: Path) -> Iterator[None]:
     except OSError as error:
         raise UsageError(f"cannot write into {folder}: {error.strerror}") from error
     with file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise UsageError(f"{folder} is in use by another run; choose another folder") from error
-        except OSError:  # a file system without locks
-            pass
+        if not try_lock(file):
+            raise UsageError(f"{folder} is in use by another run; choose another folder")
         yield
 
 

@@ -55,13 +55,14 @@ class WebServicesClient:
     """
 
     def __init__(self, address: str, *, timeout: float = 2.0) -> None:
+        refused = UsageError(f"web services: expected http://HOST or http://HOST:PORT, got {address!r}")
         try:
             parts = urlsplit(address)
             valid = parts.scheme == "http" and bool(parts.hostname) and (parts.port is None or parts.port > 0)
         except ValueError:
-            parts, valid = urlsplit(""), False
+            raise refused from None
         if not valid or parts.path not in ("", "/") or parts.query or "@" in parts.netloc or not address.isascii():
-            raise UsageError(f"web services: expected http://HOST or http://HOST:PORT, got {address!r}")
+            raise refused
         self.address = f"http://{parts.netloc}"
         self._timeout = timeout
         passwords = urllib.request.HTTPPasswordMgrWithDefaultRealm()

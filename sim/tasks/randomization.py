@@ -148,8 +148,7 @@ class Randomization:
 
         A number fixes the quantity; a pair (low, high) sets the range and keeps the kind of distribution, except that a
         normal one becomes uniform. The other quantities keep their random values, unless a quantity changes to or from
-        `Fixed`. Raises UsageError for an unknown
-        quantity or an invalid range.
+        `Fixed`. Raises UsageError for an unknown quantity or an invalid range.
         """
         quantities = dict(self.quantities)
         samples = {name: values for name, values in self.samples.items() if name not in changes}

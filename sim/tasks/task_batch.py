@@ -109,14 +109,12 @@ class TaskBatch(ABC):
         self._started |= rows
         if options or keep_ended:
             return
-        for _ in range(_MAX_RESET_ROUNDS):
+        for left in reversed(range(_MAX_RESET_ROUNDS + 1)):
             ended = rows & (self.terminated | self.truncated)
             if not ended.any():
                 return
-            self._reset(ended, rng, {})
-        ended = rows & (self.terminated | self.truncated)
-        if not ended.any():
-            return
+            if left:
+                self._reset(ended, rng, {})
         succeeded = int((ended & self.info["success"]).sum())
         raise SimulationError(
             f"{self.description.name}: no valid start in {_MAX_RESET_ROUNDS} rounds: every episode ended at once; in "

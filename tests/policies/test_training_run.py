@@ -16,6 +16,7 @@ from gelflow.policies.episodes import evaluate_task
 from gelflow.policies.networks.cnn import CNN
 from gelflow.policies.networks.mlp import MLP
 from gelflow.policies.ppo import PPO, PPOSettings
+from gelflow.policies.training.folder import try_lock
 from gelflow.policies.training.progress_log import read_table
 from gelflow.policies.training.run import Progress, RunSettings, TrainingRun, locked
 from gelflow.policies.training.state import load_state
@@ -210,3 +211,12 @@ def test_impossible_settings_are_rejected() -> None:
             PPOSettings(**changes)
     with pytest.raises(UsageError, match="above 0"):
         RunSettings(steps=0)
+
+
+def test_a_locked_file_is_not_locked_again_until_it_is_closed(tmp_path: Path) -> None:
+    path = tmp_path / "lock"
+    path.touch()
+    with path.open("r+b") as first, path.open("r+b") as second:
+        assert try_lock(first) and not try_lock(second)
+        first.close()
+        assert try_lock(second)

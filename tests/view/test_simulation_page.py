@@ -35,6 +35,9 @@ def test_a_loop_of_ones_own_shows_the_latest_state() -> None:
         for node, pose in zip(viewer._view._bodies, sim.poses()[1], strict=True):
             np.testing.assert_allclose(node.position, pose[:3])
         assert "environment 1 of 2" in viewer._status.content
+        viewer._post(viewer._choose_env, 0)
+        viewer._handle_events()
+        assert viewer.env == 0
 
 
 def test_updates_take_a_bounded_share_of_the_time(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,7 +21,7 @@ _STEP = 0.2  # of differences in parameters and start heights, in standard devia
 class Attempts:
     """n attempts, as in `Recordings`."""
 
-    misalignment: Array  # of the part on which each is made (n, 3)
+    misalignment: Array  # of the part on which each is made (n, 3), or of all (3,)
     planar_pose: Array  # of the gripper in the taught frame of the hole (n, 3)
     z: Array  # start heights above the nominal one (n,) [m]
     depth: Array  # (n,) [m]

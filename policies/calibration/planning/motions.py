@@ -2,15 +2,14 @@
 
 The hole's pose and the parameters are not known when a plan is made. The information of an attempt is therefore
 averaged over scenarios: parameters from the prior, or from a fit with its uncertainty, and misalignments from the task.
-An attempt that ends without contact in a scenario, such as one whose part enters the hole, has no information there: it
-is not calibrated. All attempts are made on one part, so
-that they share one misalignment.
+An attempt that ends without contact in a scenario, such as one whose part enters the hole, has no information there,
+since a calibration does not use it. All attempts are made on one part, so that they share one misalignment.
 """
 
 import contextlib
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +20,7 @@ from gelflow.policies.calibration.model.error_model import DRIFT
 from gelflow.policies.calibration.model.reading_model import ReadingModel, displacement_scale
 from gelflow.policies.calibration.model.shear_model import Descents
 from gelflow.policies.calibration.planning.information import Attempts, information, pose_prior, without_pose
+from gelflow.policies.calibration.problem import in_hole
 from gelflow.policies.calibration.recordings import Recordings
 from gelflow.session.motion_plan import PlannedMotion
 from gelflow.task import InsertionTask
@@ -83,9 +83,9 @@ def plan_motions(
         point = _point(len(readings.fitted), fitted, rng)
         misalignment = task.draw_misalignment(rng, 1)[0]
         with contextlib.suppress(SimulationError):  # a gripper that cannot hold the part
-            attempts = Attempts(np.tile(misalignment, (len(poses), 1)), poses, np.zeros(len(poses)), np.zeros(0))
-            depths, shear = _stops(readings, point, attempts, stop_shear_mm / per_newton)
-            each = information(readings, point, replace(attempts, depth=depths), noise, drift)
+            depths, shear = _stops(readings, point, in_hole(misalignment, poses), stop_shear_mm / per_newton)
+            attempts = Attempts(misalignment, poses, np.zeros(len(poses)), depths)
+            each = information(readings, point, attempts, noise, drift)
             found.append(np.where((shear > _CONTACT_SHEAR_MM / per_newton)[:, None, None], each, 0.0))
         progress(k + 1)
     if not found:
@@ -125,13 +125,16 @@ def _point(count: int, fitted: FitResult | None, rng: np.random.Generator) -> Ar
     return np.asarray(start.point[:count] + np.linalg.cholesky(fitted.covariance) @ np.clip(drawn, -1.7, 1.7))
 
 
-def _stops(readings: ReadingModel, point: Array, attempts: Attempts, stop_shear: float) -> tuple[Array, Array]:
-    """Depths (n,) [m] at which a mean shear of `stop_shear` [N] stops the attempts, and the shear there (n,) [N]."""
-    n, task = len(attempts.planar_pose), readings.forces.task
+def _stops(readings: ReadingModel, point: Array, poses: Array, stop_shear: float) -> tuple[Array, Array]:
+    """Depths [m] at which a mean shear of `stop_shear` [N] stops attempts, and the shear there [N], (n,) each.
+
+    `poses` (n, 3) are those of the gripper in the hole frame.
+    """
+    n, task = len(poses), readings.forces.task
     depths = np.geomspace(_FIRST_LEVEL, task.descent, _LEVELS)
     values = {name: np.full(n * _LEVELS, value) for name, value in readings.values(point).items()}
-    pose = np.repeat(attempts.descents().pose, _LEVELS, 0)
-    reading, _ = readings.read(values, Descents(pose, np.zeros(n * _LEVELS), np.tile(depths, n)))
+    descents = Descents(np.repeat(poses, _LEVELS, 0), np.zeros(n * _LEVELS), np.tile(depths, n))
+    reading, _ = readings.read(values, descents)
     shear = np.abs(reading.reshape(n, _LEVELS, 2, -1, 2)[..., 0].mean(3)).max(2)
     stopped = shear > stop_shear
     level = np.where(stopped.any(1), stopped.argmax(1), _LEVELS - 1)

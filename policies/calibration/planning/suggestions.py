@@ -44,7 +44,7 @@ def suggest(problem: Problem, result: FitResult, count: int = 3) -> list[Suggest
     for text, pose, deeper in _CANDIDATES:
         depth = _DEPTH + deeper
         try:
-            attempt = Attempts(np.zeros((1, 3)), np.array([pose]), np.zeros(1), np.array([depth]))
+            attempt = Attempts(np.zeros(3), np.array([pose]), np.zeros(1), np.array([depth]))
             noise, drift = problem.errors.noise, result.best.drift
             added = information(problem.readings, result.best.point, attempt, noise, drift)[0]
             after = np.linalg.inv(known + without_pose(added, pose_prior(problem.recordings.task)))

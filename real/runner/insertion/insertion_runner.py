@@ -29,8 +29,8 @@ from gelflow.real.wsg.checks import holds_part
 from gelflow.session.records import Decision
 from gelflow.task import InsertionTask
 
-_STATE_TIME = 0.2  # after a refused grasp, until the gripper's state is that after it [s]
-_LEVEL = 0.5e-3  # largest distance below the hand-over at which the gripper is not raised first [m]
+_STATE_TIME = 0.2  # after a refused grasp, until the state of the gripper shows its result [s]
+_LEVEL = 0.5e-3  # a gripper that is lower than the hand-over by less is not raised first [m]
 _HAND_OVER_TIME = 3.0  # after the grasp, for the operator to let the part go [s]
 
 

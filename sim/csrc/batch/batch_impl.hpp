@@ -269,16 +269,11 @@ void Batch<T>::contact_forces(T* out) {
     Workspace<T>& w = memory_[thread].work;
     kinematics(e, w);
     w.residual.setZero();
+    std::vector<T> wrenches(6 * model->contacts.size());
+    contact_wrenches<T>(*model, params_of(e), state(e).anchors, state(e).anchored, w, wrenches.data());
     for (std::size_t i = 0; i < model->contacts.size(); ++i) {
-      const Contact& contact = model->contacts[i];
-      const PointSet& set = model->point_sets[contact.points];
-      const PairFrame<T> frame = pair_frame<T>(params_of(e), set.mount, model->shapes[contact.shape], w);
-      const ContactSettings<T> settings =
-          contact_settings<T>(*model, contact, params_of(e), state(e).anchors, state(e).anchored);
-      ContactSums<T> sums;
-      find_candidate_points<T>(frame, set.cloud, settings, CacheState::stale, w.candidates[i]);
-      if (!sum_forces<false, T>(frame, w.candidates[i], settings, sums)) continue;
-      subtract_impulses<T>(contact.pair, T(1), wrench_in_world<T>(frame, sums.wrench()), false, w);
+      const V6<T> wrench = Eigen::Map<const V6<T>>(wrenches.data() + 6 * i);
+      subtract_impulses<T>(model->contacts[i].pair, T(1), wrench, false, w);
     }
     for (int k = 0; k < model->nv; ++k) out[static_cast<std::size_t>(e) * model->nv + k] = -w.residual[k];
   });

@@ -2,11 +2,12 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gelflow.cli.options import part_task
 from gelflow.cli.output import progress_bar
 from gelflow.errors import PeerError, UsageError
 from gelflow.observation import TactileFrame
@@ -16,6 +17,9 @@ from gelflow.session.messages import Damage
 from gelflow.session.reader import SessionReader
 from gelflow.session.records import described, file_digest
 from gelflow.task import InsertionTask
+
+if TYPE_CHECKING:
+    from gelflow.policies.calibration.recordings import Recordings
 
 
 def recorded_pipeline(
@@ -39,6 +43,14 @@ def replay_with_progress(
             comparisons.append(comparison)
             progress.advance(bar)
     return comparisons
+
+
+def read_attempts(paths: Sequence[Path], part: str | None) -> "Recordings":
+    """The recordings of sessions for the simulator; `part` is that of `--part`. Raises UsageError as both readers."""
+    from gelflow.policies.calibration.session_recordings import read_recordings
+
+    of_file = None if part is None else part_task(part).part
+    return read_recordings(paths, part=of_file, visible_markers=visible_markers)
 
 
 def visible_markers(description: Mapping[str, Any]) -> list[NDArray[np.bool_]]:

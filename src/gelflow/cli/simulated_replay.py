@@ -7,20 +7,17 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from gelflow.cli.exit_codes import SUCCESS
-from gelflow.cli.options import part_task
 from gelflow.cli.output import Output, progress_bar
-from gelflow.cli.session_replay import visible_markers
+from gelflow.cli.session_replay import read_attempts
 from gelflow.figures import save
-from gelflow.policies.calibration.comparison import NOTHING_IN_COMMON, noisy_markers_text, simulate
+from gelflow.policies.calibration.comparison import NOTHING_IN_COMMON, simulate, unused_markers_text
 from gelflow.policies.calibration.flow_picture import draw_flow_maps
-from gelflow.policies.calibration.session_recordings import read_recordings
 
 
 def replay_in_simulation(args: argparse.Namespace) -> int:
     """Simulate the attempts with contact of a session, and print the error of each flow map."""
     output = Output(args.json)
-    part = None if args.part is None else part_task(args.part).part
-    recordings = read_recordings([args.session], part=part, visible_markers=visible_markers)
+    recordings = read_attempts([args.session], args.part)
     with progress_bar(count=True) as progress:
         bar = progress.add_task("simulating", total=len(np.unique(recordings.insertion)))
         result = simulate(recordings, progress=lambda done: progress.update(bar, completed=done))
@@ -62,7 +59,7 @@ def replay_in_simulation(args: argparse.Namespace) -> int:
         f"root mean square error {result.error:.3g} {recordings.unit} with the values of the scene, "
         f"noise {recordings.noise():.3g} {recordings.unit}"
     )
-    if text := noisy_markers_text(result.used):
+    if text := unused_markers_text(result.used):
         output.text(text)
     for name in strange:
         output.text(f"warning: {name}: recorded and simulated flow map have nothing in common")

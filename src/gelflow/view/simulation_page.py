@@ -151,6 +151,7 @@ class SimulationPage:
             gui.add_button("Reset force scales").on_click(lambda _: self._post(self._view.reset_scales))
         self._coordinates = coordinates(self._scene)
         self._joints: Sliders | None = None
+        self._controls: Sliders | None = None
         if playable:
             self._add_sliders(gui)
 
@@ -177,7 +178,7 @@ class SimulationPage:
 
     def _choose_env(self, env: int) -> None:
         self.env = min(max(int(env), 0), self._sim.num_envs - 1)
-        if self._scene.actuators:
+        if self._controls is not None:
             self._controls.show(self._u[self.env].tolist())
 
     def _single_step(self) -> None:
@@ -190,7 +191,7 @@ class SimulationPage:
         self._u[:] = start_controls(self._scene)
         self._steps = 0
         self._view.reset_scales()
-        if self._scene.actuators:
+        if self._controls is not None:
             self._controls.show(self._u[self.env].tolist())
 
     def _move(self, number: int, value: float) -> None:

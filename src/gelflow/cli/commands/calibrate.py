@@ -22,7 +22,7 @@ from gelflow.cli.options import (
     removed_on_error,
 )
 from gelflow.cli.output import Output, progress_bar
-from gelflow.cli.session_replay import visible_markers
+from gelflow.cli.session_replay import read_attempts
 from gelflow.errors import UsageError
 from gelflow.part import CUBOID
 from gelflow.policies.calibration.calibrated_scene import MODEL, SCENE, write_scene
@@ -38,7 +38,7 @@ from gelflow.policies.calibration.planning.motions import (
 )
 from gelflow.policies.calibration.recordings import Recordings
 from gelflow.policies.calibration.report import advice_lines, error_lines, page, plain_report
-from gelflow.policies.calibration.session_recordings import nothing_recorded, read_recordings
+from gelflow.policies.calibration.session_recordings import nothing_recorded
 from gelflow.policies.training.folder import create_folder
 from gelflow.real.runner.lab import Lab
 from gelflow.real.runner.lab_file import load_lab
@@ -94,8 +94,7 @@ def run(args: argparse.Namespace) -> int:
     for file in files:
         if file.exists():
             raise UsageError(f"{file} exists; name a new folder with --out")
-    part = None if args.part is None else part_task(args.part).part
-    recordings = read_recordings(args.sessions, part=part, visible_markers=visible_markers)
+    recordings = read_attempts(args.sessions, args.part)
     if args.plan is not None:
         candidates(recordings.task, _workspace(lab))
     create_folder(args.out)

@@ -1,7 +1,6 @@
 """`gelflow render-scene SCENE`: a picture or a film of a scene with bodies, contact forces and pads."""
 
 import argparse
-import itertools
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -122,14 +121,12 @@ def _write_film(path: Path, pictures: Any, size: tuple[int, int], fps: float, co
 
     from gelflow.perception.output.writers import check_complete, video_rate
 
-    pictures = iter(pictures)
-    first = next(pictures)  # before the file is created
     partial, count = path.with_name(f"{path.stem}.part{path.suffix}").absolute(), 0
     try:
         video = cv2.VideoWriter(str(partial), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*codec), video_rate(fps), size)
         if not video.isOpened():
             raise UsageError(f"cannot write the film {path}; is its folder writable?")
-        for picture in itertools.chain([first], pictures):
+        for picture in pictures:
             video.write(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
             count += 1
         video.release()
