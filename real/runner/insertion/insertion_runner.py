@@ -25,7 +25,7 @@ from gelflow.real.runner.supervisor import Supervisor
 from gelflow.real.runner.touch.grasp_check import GraspCheck, TouchImplausible, check_grasp
 from gelflow.real.runner.touch.observer import MarkersUnreadable, TactileObserver, TactileReading
 from gelflow.real.runner.touch.pad_forces import ForceRecord, PadForces
-from gelflow.real.wsg.checks import holds_part
+from gelflow.real.wsg.checks import holds_part, may_hold_part
 from gelflow.session.records import Decision
 from gelflow.task import InsertionTask
 
@@ -105,7 +105,7 @@ class InsertionRunner:
             if holds_part(self._cell.gripper.state(), grasped=True):  # too wide, for example: it blocked the fingers
                 self._release_to_operator(number)
             else:
-                self._retreat_empty()
+                self._retreat_without_part(number)
         except PartSlipped as error:  # at the hand-over, before the first attempt
             outcome = str(error)
             self._release_to_operator(number)
@@ -139,7 +139,7 @@ class InsertionRunner:
         at the hand-over. Raises PartLost when it moves again.
         """
         if not holds_part(self._cell.gripper.state(), grasped=True):
-            self._retreat_empty()
+            self._retreat_without_part(number)
             return "part lost"
         self._motion.expect_part(True)  # with its present width
         if part is not None:
@@ -359,6 +359,12 @@ class InsertionRunner:
         self._motion.expect_part(False)
         self._motion.supervisor.phases.enter(Phase.RETREAT)
         self._rise()
+
+    def _retreat_without_part(self, number: int) -> None:
+        """Move up after the gripper reported that it holds no part; fingers that still press are opened as for one."""
+        self._retreat_empty()
+        if may_hold_part(self._cell.gripper.state(), grasped=False):
+            self._release_to_operator(number)
 
     def _rise(self) -> None:
         """Without a held part: straight up to the height of the hand-over, unless the gripper is higher.

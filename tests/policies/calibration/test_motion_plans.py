@@ -99,8 +99,8 @@ def test_a_plan_has_its_most_informative_motions_first_and_keeps_to_the_workspac
 def test_a_plan_depends_on_what_is_known_already() -> None:
     count = len(ReadingModel(LAB).fitted)
     known = StartResult(np.zeros(count), np.zeros((1, 3)), 1e-4 * np.eye(count), 0.0, 1.0, 1e-3)
-    plan = plan_motions(LAB, fitted=FitResult((known,), count), count=2, workspace=NEAR, scenarios=1)
-    unknown = plan_motions(LAB, count=2, workspace=NEAR, scenarios=1)
+    plan = plan_motions(LAB, fitted=FitResult((known,), count), count=2, workspace=NEAR, scenarios=3)
+    unknown = plan_motions(LAB, count=2, workspace=NEAR, scenarios=3)  # in the first, no attempt has contact
     assert plan.gains[0] < 0.5 * unknown.gains[0]
     assert all(after <= before < 0.1 for before, after in plan.widths.values())
 
