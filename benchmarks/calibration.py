@@ -79,7 +79,7 @@ def plan(words: list[str]) -> int:
 
 
 def transfer(words: list[str]) -> int:
-    """Evaluate the shipped policy in worlds that differ from training; calibrate and fine-tune where it fails.
+    """Evaluate the included policy in worlds that differ from training; calibrate and fine-tune where it fails.
 
     The same command continues a run that was killed.
     """
@@ -93,7 +93,7 @@ def transfer(words: list[str]) -> int:
 
     named = {world.name: world for world in worlds()}
     rows = script.measure_each(args, list(named), measured, key="world")
-    table = Table("world", "shipped policy", "calibrated and fine-tuned")
+    table = Table("world", "included policy", "calibrated and fine-tuned")
     for row in rows:
         table.add_row(row["world"], *(_result(row, key) for key in ("before", "after")))
     script.finish(args, script.header() | {"results": rows}, table)

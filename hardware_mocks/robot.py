@@ -41,7 +41,10 @@ _NEAR: Joints = (0.0, 0.3, 0.1, 0.0, 1.2, 0.0)
 
 @dataclass(frozen=True)
 class MockRobotConfig:
-    """Addresses, camera images and plant of the mock robot. Times in robot time."""
+    """Addresses, camera images and plant of the mock robot. Times in robot time.
+
+    Raises UsageError for a port outside 0 to 65535.
+    """
 
     cell: SimulatedCellConfig = field(default_factory=SimulatedCellConfig)
     host: str = "127.0.0.1"
@@ -51,6 +54,11 @@ class MockRobotConfig:
     faults: FaultPlan = field(default_factory=FaultPlan)
     time_sync: bool = True  # robot time waits for a late simulation; False: it is the scaled wall time, as on a robot
     rotations: tuple[Rotation, Rotation] = (0, 0)  # of the left and right images, clockwise [°]: 0, 90, 180 or 270
+
+    def __post_init__(self) -> None:
+        for name in ("egm_port", "tcp_port", "truth_port"):
+            if not 0 <= getattr(self, name) <= 65535:
+                raise UsageError(f"{name.replace('_', ' ')} must be within 0 to 65535, got {getattr(self, name)}")
 
     def view(self, finger: int) -> tuple[GelAppearance, Lens]:
         """Appearance of a gel in its camera's ideal image, and the camera's lens; finger 0 is the left one."""

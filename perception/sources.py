@@ -3,17 +3,21 @@
 A source is opened when its iteration starts, and iterated once. The cameras of a robot have drivers in gelflow.real.
 """
 
+import math
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeVar
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.clock import Clock, ScaledClock
-from gelflow.errors import PeerError, UsageError
+from gelflow.errors import PeerError, PeerTimeout, UsageError
 from gelflow.perception.capture import Capture
+from gelflow.perception.errors import TrackerInitError
 from gelflow.perception.frames import ENCODED, ImageDecoder, UnreadableImage
 from gelflow.perception.sensors.profile import SensorProfile, load_sensor_profile
 from gelflow.session.reader import SessionReader
@@ -22,6 +26,9 @@ from gelflow.session.records import SENSORS
 Image = NDArray[np.uint8]
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".ppm", ".pgm"})
+_START_LIMIT = 2.0  # for the start of a tracker on the images of a live source [s]
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -38,8 +45,8 @@ class SourceImage:
 class SkippedImages:
     """The images of a source that are not tracked."""
 
-    unreadable: int = 0  # cannot be decoded
-    first: str = ""  # name of the first unreadable one and why it cannot be read
+    unreadable: int = 0  # cannot be decoded, or a tracker could not start on them
+    first: str = ""  # name of the first unreadable one and the reason
     dropped: int = 0  # live images that arrived while the program was behind
 
     def add(self, name: str, reason: object) -> None:
@@ -70,7 +77,8 @@ class ImageSource:
     def __iter__(self) -> Iterator[SourceImage]:
         """Iterates over the images; those that cannot be decoded are skipped and counted in `skipped`.
 
-        Raises PeerError when no image can be read, a video ends early, or the image size changes.
+        Raises PeerError when no image can be read, a video ends early, or the image size changes, UsageError for a TIFF
+        file with several pages.
         """
         if self.kind == "session":
             images = self._from_session()
@@ -129,6 +137,7 @@ class ImageSource:
             except OSError as error:
                 self.skipped.add(str(file), f"cannot be read: {error.strerror}")
             else:
+                _check_pages(file)
                 kept = data if data.startswith(ENCODED) else None
                 yield SourceImage(file.name, image, number / self.rate, self._original(kept))
 
@@ -169,7 +178,8 @@ def image_source(
 ) -> ImageSource:
     """The image source at `text`: the number of a camera, the URL of a stream, an .mcap session, a folder or a file.
 
-    Where a file or folder has the number of a camera as its name, ./7 is the file and 07 the camera.
+    Camera 2 is also uvc:2 or uvc:/dev/video2, as in a lab file. Where a file or folder has the number of a camera as
+    its name, ./7 is the file and 07 the camera.
     `sensor` selects the camera of a session; `rate` [Hz] gives the time stamps of a folder; `profile` is that of the
     sensor, whose part of each image is used. Raises UsageError when the file or folder does not exist, or the folder
     contains no images.
@@ -181,13 +191,13 @@ def image_source(
     if not 0.01 <= rate <= 10000:
         raise UsageError(f"rate must be within 0.01 to 10000 Hz, got {rate}")
     profile = profile or load_sensor_profile("generic")
-    if text.isascii() and text.isdigit():
-        if Path(text).exists():
+    if camera := re.fullmatch(r"(?:uvc:(?:/dev/video)?)?([0-9]+)", text):
+        if camera[1] == text and Path(text).exists():
             raise UsageError(
                 f"{text} is a camera and a file or folder: write ./{text} for this, 0{text} for the camera"
             )
-        return ImageSource(text, "camera", rate=rate, profile=profile)
-    if re.match(r"[a-zA-Z][a-zA-Z0-9+.-]*://", text):
+        return ImageSource(camera[1], "camera", rate=rate, profile=profile)
+    if not text.startswith("uvc:") and re.match(r"[a-zA-Z][a-zA-Z0-9+.-]*://", text):
         return ImageSource(text, "stream", rate=rate, profile=profile)
     path = Path(text)
     if path.suffix.lower() == ".mcap":
@@ -203,6 +213,33 @@ def image_source(
     return ImageSource(text, "image" if files else "video", files, rate=rate, profile=profile)
 
 
+def start_on_image(
+    source: ImageSource, images: Iterator[SourceImage], start: Callable[[Image], T]
+) -> tuple[SourceImage, T]:
+    """The first of `images`, those of `source`, and the result of `start` for it.
+
+    Raises the TrackerInitError of `start`. In a live source, images on which `start` fails are skipped and counted for
+    2 s before.
+    """
+    limit = math.inf
+    failed: TrackerInitError | None = None
+    try:
+        for image in images:
+            try:
+                return image, start(image.image)
+            except TrackerInitError as error:
+                limit, failed = min(limit, image.stamp + _START_LIMIT), error
+            if not source.live or image.stamp >= limit:
+                break
+            source.skipped.add(f"image {image.name}", failed)
+    except PeerTimeout:  # the live source ends
+        if failed is None:
+            raise
+    if failed is None:
+        raise PeerError(f"{source.kind} {source.text} gave no image")
+    raise failed
+
+
 def natural_sort_key(path: Path) -> tuple[tuple[int, int, str], ...]:
     """Sort key that orders 9.jpg before 10.jpg."""
     parts = re.split(r"([0-9]+)", path.name)
@@ -211,3 +248,9 @@ def natural_sort_key(path: Path) -> tuple[tuple[int, int, str], ...]:
 
 def _is_image(path: Path) -> bool:
     return path.suffix.lower() in IMAGE_SUFFIXES and path.is_file() and not path.name.startswith(".")
+
+
+def _check_pages(file: Path) -> None:
+    """Raise UsageError for a TIFF file with several pages, of which only the first would be read."""
+    if file.suffix.lower() in (".tif", ".tiff") and (pages := cv2.imcount(str(file))) > 1:
+        raise UsageError(f"{file} has {pages} pages; split it into a folder of images")

@@ -58,7 +58,7 @@ class ImitationSettings:
     # Error of a correction that counts as 1 [m, m, rad]; None: `part_tolerance`.
     tolerance: tuple[float, float, float] | None = None
     bounded: float = 0.9  # share of the bounded loss, reached after the part `bounded_after` of the training
-    bounded_after: float = 0.3
+    bounded_after: float = 0.3  # 0: from the first update
     # Largest standard deviation of the exploration, in units of the reach: at the start and at the end.
     exploration: tuple[float, float] = (0.4, 0.03)
 
@@ -145,7 +145,8 @@ class Imitation(Learner):
         settings = self._settings
         for group in self._optimizer.param_groups:
             group["lr"] = settings.learning_rate * (1 - progress)
-        bounded = settings.bounded * min(1.0, progress / max(settings.bounded_after, 1e-9))
+        reached = min(1.0, progress / settings.bounded_after) if settings.bounded_after > 0 else 1.0
+        bounded = settings.bounded * reached
         scale = torch.as_tensor(self._tolerance, dtype=torch.float32)
         for _ in range(settings.updates):
             inputs, targets, starts = _draw_batch(self._memory, settings.batch, rng)

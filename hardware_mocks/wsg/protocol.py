@@ -34,7 +34,7 @@ from gelflow.real.wsg.constants import (
 )
 
 _PACKET_TIMEOUT = 0.5  # an incomplete packet is abandoned after this time [s]
-_ACCEPTED_AT_ANY_RATE = (Command.STOP, Command.FAST_STOP, Command.DISCONNECT)
+_ACCEPTED_AT_ANY_RATE = (Command.STOP, Command.FAST_STOP)
 
 _WSG_50, _FIRMWARE = 1, 0x0400  # device type and firmware version
 

@@ -12,11 +12,13 @@ constexpr double max_difference = 0.45;      // of the displacements of neighbou
 constexpr double inconsistency_cost = 0.75;  // of neighbours with a larger difference; 0.5 at this difference
 constexpr double extrapolation = 0.7;        // damping of the linear extrapolation
 constexpr double search_radius = 1.15;       // of the markers around a dot that the placement search tries
-constexpr double motion_weight = 0.1;        // cost of moving by one spacing; an unassigned marker or dot costs 1
+constexpr double motion_weight = 0.5;        // cost of moving by one spacing, in lines; an unassigned marker costs 1
+constexpr double missing_line = 0.5;         // share of a line without dots that a wrong jump by one line may have left
 constexpr int search_interval = 10;          // images between placement searches while a failure persists
 }  // namespace
 
-DotAssignment::DotAssignment(Grid grid, double spacing) : grid_(grid), spacing_(spacing) {
+DotAssignment::DotAssignment(Grid grid, double spacing, double width, double height)
+    : grid_(grid), spacing_(spacing), width_(width), height_(height) {
   const std::size_t n = std::size_t(grid.size());
   dot_of_.reserve(n), best_dot_of_.resize(n), last_.reserve(n), dropped_.reserve(n), heap_.reserve(16 * n);
 }
@@ -163,16 +165,21 @@ void DotAssignment::grow() {
   }
 }
 
-DotAssignment::Score DotAssignment::evaluate(const std::vector<char>& expected) const {
+DotAssignment::Score DotAssignment::evaluate() const {
   Score score;
   const double unit = 1 / (spacing_ * spacing_);
+  const double motion_cost = motion_weight * std::min(grid_.rows, grid_.cols) / grid_.size();
   for (int m = 0; m < grid_.size(); ++m) {
     if (dot_of_[std::size_t(m)] < 0) {
-      score.markers += expected[std::size_t(m)];
+      Point displacement{};
+      predict_displacement(m, displacement);
+      const Point p = last_[std::size_t(m)] + displacement;
+      const bool inside = p.x > 0 && p.y > 0 && p.x < width_ - 1 && p.y < height_ - 1;
+      score.markers += visible_[std::size_t(m)] && inside;
       continue;
     }
     const Point displacement = displacement_of(m);
-    score.cost += motion_weight * std::min(squared(displacement) * unit, 2.0);
+    score.cost += motion_cost * std::min(squared(displacement) * unit, 2.0);
     for (int direction : {Grid::rightward, Grid::downward}) {  // each pair once
       const int other = grid_.neighbour(m, direction);
       if (!is_assigned(other)) continue;
@@ -188,14 +195,21 @@ DotAssignment::Score DotAssignment::evaluate(const std::vector<char>& expected) 
 }
 
 // Keeps the current hypothesis if it has the lowest cost. True when it explains the image as well as usual.
-bool DotAssignment::keep_if_best(const std::vector<char>& expected) {
-  const Score score = evaluate(expected);
+bool DotAssignment::keep_if_best() {
+  const Score score = evaluate();
   if (score.cost < best_score_.cost) best_score_ = score, best_dot_of_ = dot_of_;
-  return score.unexplained() <= usual_unexplained_ + 1;
+  return score.unexplained() <= last_score_.unexplained() + 1 && !misses_a_line(score);
+}
+
+// Whether many more markers or dots than in the last image are not assigned: after a jump by most of a spacing, the dots
+// of an outer line may have left or entered the image, and the nearest dots are those of the neighbours.
+bool DotAssignment::misses_a_line(const Score& score) const {
+  const double many = missing_line * std::min(grid_.rows, grid_.cols);
+  return score.markers > last_score_.markers + many || score.dots > last_score_.dots + many;
 }
 
 // Grows one hypothesis for each of a few dots and each marker around it; stops after two seeds without improvement.
-void DotAssignment::search_placements(const std::vector<char>& expected) {
+void DotAssignment::search_placements() {
   Point low{1e9, 1e9}, high{-1e9, -1e9};
   for (Point p : last_) {
     low = {std::min(low.x, p.x), std::min(low.y, p.y)};
@@ -217,8 +231,8 @@ void DotAssignment::search_placements(const std::vector<char>& expected) {
       reset();
       assign_dot(m, dot);
       grow();
-      keep_if_best(expected);
-      if (best_score_.unexplained() == 0) return;
+      keep_if_best();
+      if (best_score_.unexplained() == 0 && !misses_a_line(best_score_)) return;
     }
     failures = best_score_.cost < before ? 0 : failures + 1;
   }
@@ -247,26 +261,26 @@ void DotAssignment::drop_inconsistent() {
 }
 
 const std::vector<int>& DotAssignment::assign(const std::vector<Dot>& dots, const std::vector<Point>& last,
-                                              const std::vector<Point>& velocity, const std::vector<char>& expected) {
+                                              const std::vector<Point>& velocity, const std::vector<char>& visible) {
   build_cells(dots);
-  last_ = last;
+  last_ = last, visible_ = visible;
   best_score_ = {};
   best_score_.cost = 1e18;
   predicted_ = last;
   for (std::size_t m = 0; m < last.size(); ++m) predicted_[m] = last[m] + velocity[m];
   seed_nearest(predicted_);
   grow();
-  bool done = keep_if_best(expected);
+  bool done = keep_if_best();
   if (!done) {
     seed_nearest(last);
     grow();
-    done = keep_if_best(expected);
+    done = keep_if_best();
   }
   if (!done || ++images_since_search_ >= search_interval) {
-    if (best_score_.unexplained() > 0) search_placements(expected);
+    if (best_score_.unexplained() > 0 || misses_a_line(best_score_)) search_placements();
     images_since_search_ = 0;
   }
-  usual_unexplained_ = best_score_.unexplained();
+  last_score_ = best_score_;
   dot_of_ = best_dot_of_;
   drop_inconsistent();
   return dot_of_;

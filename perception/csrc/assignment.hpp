@@ -3,11 +3,11 @@
 // A hypothesis starts from a few dots that are assigned to markers and grows over the grid: the displacement of a marker
 // since the last image is predicted from its assigned neighbours (extrapolated linearly where two lie in a line with
 // it), and the candidate with the smallest prediction error is assigned first. The cost of a hypothesis counts markers
-// without a dot, dots without a marker, inconsistent displacements of neighbours and, with a small weight, the total
-// motion.
+// without a dot inside the image, dots without a marker, inconsistent displacements of neighbours and, with a small
+// weight, the mean motion.
 //
 // The first hypotheses start from the dots nearest to the predicted and to the last marker positions. They fail where
-// markers jump by more than half their spacing. Then a search assigns each of a few dots, spread over the image, to each
+// markers jump by more than half their spacing, and may then lack a line of markers only. Then a search assigns each of a few dots, spread over the image, to each
 // of the markers around it in turn, grows the whole grid from that pair, and keeps the hypothesis with the lowest cost.
 // The order of operations is fixed; nothing is random.
 #pragma once
@@ -21,12 +21,13 @@ namespace gelflow::perception {
 
 class DotAssignment {
  public:
-  DotAssignment(Grid grid, double spacing);
+  // `width` and `height` are those of the image [px].
+  DotAssignment(Grid grid, double spacing, double width, double height);
 
   // The index in `dots` of each marker's dot, or −1. Per marker: `last` is the last position, `velocity` the
-  // displacement per image, `expected` whether its dot should be visible.
+  // displacement per image, `visible` whether its dot can be seen inside the image.
   const std::vector<int>& assign(const std::vector<Dot>& dots, const std::vector<Point>& last,
-                                 const std::vector<Point>& velocity, const std::vector<char>& expected);
+                                 const std::vector<Point>& velocity, const std::vector<char>& visible);
 
  private:
   struct Candidate {  // a dot near the predicted position of a marker
@@ -37,9 +38,10 @@ class DotAssignment {
     }
   };
   struct Score {                // of a hypothesis
-    int markers = 0, dots = 0;  // expected markers and dots that are not assigned
+    int markers = 0, dots = 0;  // markers with their centre in the image, and dots, that are not assigned
     int inconsistent = 0;       // pairs of neighbours with different displacements
     double cost = 0;
+    // From bridges and dust, if there are few; markers without a dot alone may be covered.
     int unexplained() const { return std::min(markers, dots) + inconsistent; }
   };
 
@@ -52,9 +54,10 @@ class DotAssignment {
   bool predict_displacement(int marker, Point& displacement) const;
   void push_candidate(int marker);
   void grow();
-  Score evaluate(const std::vector<char>& expected) const;
-  bool keep_if_best(const std::vector<char>& expected);
-  void search_placements(const std::vector<char>& expected);
+  Score evaluate() const;
+  bool keep_if_best();
+  bool misses_a_line(const Score& score) const;
+  void search_placements();
   void drop_inconsistent();
 
   bool is_assigned(int marker) const { return marker >= 0 && dot_of_[std::size_t(marker)] >= 0; }
@@ -63,13 +66,13 @@ class DotAssignment {
   }
 
   Grid grid_;
-  double spacing_;
+  double spacing_, width_, height_;
   std::vector<Point> positions_, last_, predicted_;
   std::vector<int> dot_of_, best_dot_of_, dropped_;
-  std::vector<char> is_taken_;
+  std::vector<char> is_taken_, visible_;
   std::vector<Candidate> heap_;
   Score best_score_;
-  int usual_unexplained_ = 0;    // unexplained items of the last image, from bridges and dust
+  Score last_score_;             // of the last image
   int images_since_search_ = 0;  // since the last search over placements
   // Dots sorted into square cells of one spacing: cell_dots_[cell_begin_[c]] … cell_dots_[cell_begin_[c + 1] − 1].
   int cells_x_ = 0, cells_y_ = 0;

@@ -25,6 +25,7 @@ constexpr float refit_change = 0.01f;       // relative change of a shape for wh
 constexpr int relaxation_steps = 8;
 constexpr int max_rest_images = 8;      // images averaged in the rest positions
 constexpr double rest_coherence = 0.3;  // largest ratio of coherent to independent squared displacement at rest
+constexpr double rest_outlier = 8;      // displacement of a marker that is not at rest, in medians of all markers
 
 // Side of the fit window of a dot: wide enough to determine the background slope, without the neighbouring dots. A dot
 // that is far longer than the others, as at the border of a wide-angle image, is not cut.
@@ -53,7 +54,7 @@ Tracker::Tracker(TrackerSetup setup)
       rest_quality_(setup_.rest.size()),
       plane_(setup_.width, setup_.height),
       detector_(setup_.width, setup_.height, setup_.radius, setup_.spacing, setup_.bright),
-      assignment_(setup_.grid, setup_.spacing) {
+      assignment_(setup_.grid, setup_.spacing, setup_.width, setup_.height) {
   const std::size_t n = setup_.rest.size();
   for (std::size_t m = 0; m < n; ++m) {
     const DotShape& f = setup_.shape[m];
@@ -72,7 +73,7 @@ Tracker::Tracker(TrackerSetup setup)
   shape_ = next_shape_ = setup_.shape;
   velocity_.resize(n), displacement_.resize(n), relaxed_.resize(n), detection_offset_.resize(n);
   quality_.resize(n), contrasts_.resize(n);
-  measured_.resize(n), filled_.resize(n), expected_.resize(n);
+  measured_.resize(n), filled_.resize(n);
   dots_.reserve(2 * n + 64);
 }
 
@@ -108,15 +109,15 @@ void Tracker::start(const std::uint8_t* bgr) {
       }
   if (responses.empty()) return;
   threshold_ = float(min_response_ratio) * median(std::move(responses));
+  detector_.detect(plane_, threshold_, 2 * setup_.rest.size() + 64, dots_);
+  assignment_.assign(dots_, positions_, velocity_, setup_.visible);  // so that it knows what is usually not assigned
 }
 
 void Tracker::track(const std::uint8_t* bgr) {
   extract_plane(bgr, plane_, setup_.channel);
   detector_.detect(plane_, threshold_, 2 * setup_.rest.size() + 64, dots_);
   previous_ = positions_;
-  for (std::size_t m = 0; m < positions_.size(); ++m)
-    expected_[m] = char(setup_.visible[m] && is_inside(m, previous_[m] + velocity_[m]));
-  measure(assignment_.assign(dots_, previous_, velocity_, expected_));
+  measure(assignment_.assign(dots_, previous_, velocity_, setup_.visible));
   anything_valid_ = std::any_of(measured_.begin(), measured_.end(), [](char k) { return k != 0; });
   if (rest_images_ > 0) refine_rest();
   const double limit = max_velocity * setup_.spacing;
@@ -149,23 +150,35 @@ void Tracker::refine(const std::uint8_t* bgr, const std::vector<Point>& position
 
 // While nothing moves after the start, the rest positions become the mean over the images, which reduces the noise that
 // the reference adds to each displacement. Noise is independent between markers and motion is common to neighbours: for
-// independent noise, the squared mean of the eight neighbours is 0.12 times the squared deviation from it.
+// independent noise, the squared mean of the eight neighbours is 0.12 times the squared deviation from it. A marker that
+// is far from its rest position moves alone or is measured wrongly: its rest position stays, and without it the others
+// must be at rest too.
 void Tracker::refine_rest() {
+  std::vector<float> squares;
+  for (std::size_t m = 0; m < displacement_.size(); ++m) {
+    displacement_[m] = positions_[m] - setup_.rest[m];
+    if (measured_[m]) squares.push_back(float(squared(displacement_[m])));
+  }
   filled_ = measured_;
+  bool at_rest = !squares.empty() && rest_images_ < max_rest_images && is_incoherent();
+  const double largest = squares.empty() ? 0 : rest_outlier * rest_outlier * median(std::move(squares));
+  for (std::size_t m = 0; m < displacement_.size(); ++m)
+    filled_[m] = measured_[m] && squared(displacement_[m]) <= largest;
+  at_rest = at_rest && is_incoherent();
+  rest_images_ = at_rest ? rest_images_ + 1 : 0;
+  for (std::size_t m = 0; at_rest && m < displacement_.size(); ++m)
+    if (filled_[m]) setup_.rest[m] = setup_.rest[m] + (1.0 / rest_images_) * displacement_[m];
+}
+
+// Whether the displacements of the `filled_` markers are independent of those of their neighbours, as noise is.
+bool Tracker::is_incoherent() const {
   double coherent = 0, independent = 0;
-  for (std::size_t m = 0; m < displacement_.size(); ++m) displacement_[m] = positions_[m] - setup_.rest[m];
   for (std::size_t m = 0; m < displacement_.size(); ++m) {
     Point mean;
-    if (!measured_[m] || !neighbour_mean(int(m), mean)) continue;
+    if (!filled_[m] || !neighbour_mean(int(m), mean)) continue;
     coherent += squared(mean), independent += squared(displacement_[m] - mean);
   }
-  if (!(coherent < rest_coherence * independent) || rest_images_ == max_rest_images) {
-    rest_images_ = 0;
-    return;
-  }
-  ++rest_images_;
-  for (std::size_t m = 0; m < displacement_.size(); ++m)
-    if (measured_[m]) setup_.rest[m] = setup_.rest[m] + (1.0 / rest_images_) * displacement_[m];
+  return coherent < rest_coherence * independent;
 }
 
 // Fits the assigned dots, then searches missing ones at interpolated positions, and infers the remaining markers.

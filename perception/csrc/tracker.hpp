@@ -66,6 +66,7 @@ class Tracker {
   bool neighbour_mean(int marker, Point& mean) const;
   void fill_missing();
   void refine_rest();
+  bool is_incoherent() const;
 
   TrackerSetup setup_;
   FitSettings settings_;
@@ -83,7 +84,7 @@ class Tracker {
   std::vector<Point> detection_offset_;  // from a detected dot to its fitted centre, at rest [px]
   std::vector<Point> positions_, previous_, velocity_, displacement_, relaxed_;
   std::vector<double> quality_, contrasts_;
-  std::vector<char> measured_, filled_, expected_;
+  std::vector<char> measured_, filled_;
   bool anything_valid_ = false;
   int rest_images_ = 0;  // images averaged in the rest positions; 0 when these are final
 };

@@ -32,6 +32,9 @@ _FEWEST = 3  # images with contact and measured force
 _LAG_ERROR = 0.05  # of the modulus, relative to the creep
 _LAG_IMAGES = 30  # fewer do not determine a lag
 _LAG_EVIDENCE = 10.0  # by which the Bayesian information criterion must improve
+# A table of at least so many rows has another unit of time than seconds if it is so many times longer than the images
+# and has less than this share of rows for each image with contact.
+_UNIT_ROWS, _UNIT_SPAN, _UNIT_SHARE = 10, 50.0, 0.02
 
 
 @dataclass(frozen=True)
@@ -40,6 +43,7 @@ class ForceSamples:
 
     stamp: Array  # [s], shape (n,)
     contact: NDArray[np.intp]  # number of the contact that an image belongs to, shape (n,)
+    started: NDArray[np.bool_]  # the image before its contact was measured, without a contact; shape (n,)
     normal: Array  # estimated, shape (n,)
     shear: Array
     measured_normal: Array
@@ -88,24 +92,12 @@ def read_samples(estimates: Path, measured: Path) -> ForceSamples:
             f"{measured} needs the column stamp or image, and normal_n or shear_n [N]; it has {', '.join(columns)}"
         )
     in_time = "stamp" in columns
-    if in_time and (np.diff([_number(row, "stamp", estimates) for row in rows]) < 0).any():
-        raise UsageError(f"{estimates}: stamps must not decrease: track one recording without a jump of its time")
-    known = {name: _measurements(table, name, measured, in_time=in_time) for name in ("normal_n", "shear_n")}
-    kept: list[tuple[float, ...]] = []
-    contact, touching = -1, False
-    for row in rows:
-        if row["contact"] != "1":
-            touching = False
-            continue
-        contact += 1 if not (touching and in_time) else 0
-        touching = True
-        stamp = _number(row, "stamp", estimates)
-        values = [known[name](stamp, row["image"]) for name in ("normal_n", "shear_n")]
-        shear = math.hypot(_number(row, "shear_right_n", estimates), _number(row, "shear_down_n", estimates))
-        kept.append((stamp, contact, _number(row, "normal_n", estimates), shear, *values))
-    data = np.array(kept).reshape(-1, 6)
-    data = data[np.isfinite(data[:, 4:]).any(1)]
-    for name, forces in (("normal_n", data[:, 4]), ("shear_n", data[:, 5])):
+    known = [_measurements(table, name, measured, in_time=in_time) for name in ("normal_n", "shear_n")]
+    if in_time:
+        _check_times(rows, known, estimates, measured)
+    data = _contact_rows(rows, known, estimates)
+    data = data[np.isfinite(data[:, 5:]).any(1)]
+    for name, forces in (("normal_n", data[:, 5]), ("shear_n", data[:, 6])):
         if (largest := np.nanmax(np.abs(forces), initial=0.0)) > _LARGEST_FORCE:
             raise UsageError(f"{measured}: {name} is {largest:.3g}; forces are in newtons")
         if np.nansum(forces) < 0:
@@ -118,12 +110,56 @@ def read_samples(estimates: Path, measured: Path) -> ForceSamples:
     return ForceSamples(
         stamp=data[:, 0],
         contact=data[:, 1].astype(np.intp),
-        normal=data[:, 2],
-        shear=data[:, 3],
-        measured_normal=data[:, 4],
-        measured_shear=data[:, 5],
+        started=data[:, 2].astype(bool),
+        normal=data[:, 3],
+        shear=data[:, 4],
+        measured_normal=data[:, 5],
+        measured_shear=data[:, 6],
         in_time=in_time,
     )
+
+
+def _check_times(rows: list[dict[str, str]], known: "list[_Measurements]", estimates: Path, measured: Path) -> None:
+    """Raise UsageError where the stamps of images decrease, or those of measurements are not in seconds."""
+    stamps = np.array([_number(row, "stamp", estimates) for row in rows])
+    if (np.diff(stamps) < 0).any():
+        raise UsageError(f"{estimates}: stamps must not decrease: track one recording without a jump of its time")
+    touched = stamps[np.array([row["contact"] == "1" for row in rows])]
+    for times in (part.stamps for part in known):
+        if times is None or len(times) < _UNIT_ROWS or not len(touched):
+            continue
+        used = int(((times >= touched[0]) & (times <= touched[-1])).sum())
+        if np.ptp(times) > _UNIT_SPAN * np.ptp(stamps) and used < max(2.0, _UNIT_SHARE * len(touched)):
+            raise UsageError(
+                f"{measured}: {used} of {len(times)} rows are between the first and the last image with contact "
+                f"({touched[0]:g} to {touched[-1]:g} s): stamp must be in seconds"
+            )
+
+
+def _contact_rows(rows: list[dict[str, str]], known: "list[_Measurements]", path: Path) -> Array:
+    """One row per image with contact, shape (n, 7): stamp, number of the contact, whether its start was seen,
+    estimated normal and shear force, measured normal and shear force.
+
+    A contact lasts until an image without one. An image without an estimate does not end it.
+    """
+    kept: list[tuple[float, ...]] = []
+    contact, touching, started = -1, False, False
+    free = False  # the image before was measured and without a contact
+    for row in rows:
+        if not row["contact"]:
+            free = False
+            continue
+        stamp = _number(row, "stamp", path)
+        values = [part(stamp, row["image"]) for part in known]
+        if row["contact"] != "1":
+            touching = False
+            free = all(math.isfinite(value) for value, part in zip(values, known, strict=True) if len(part.values))
+            continue
+        if not touching:
+            contact, touching, started = contact + 1, True, free
+        shear = math.hypot(_number(row, "shear_right_n", path), _number(row, "shear_down_n", path))
+        kept.append((stamp, contact, started, _number(row, "normal_n", path), shear, *values))
+    return np.array(kept, dtype=float).reshape(-1, 7)
 
 
 def fit_gel(samples: ForceSamples, gel: ElasticGel) -> GelFit:
@@ -205,9 +241,10 @@ def _lag(samples: ForceSamples) -> tuple[float, float, float | None]:
     known = samples.measured_normal if np.isfinite(samples.measured_normal).all() else samples.measured_shear
     estimated = samples.normal if known is samples.measured_normal else samples.shear
     none = 0.0, 0.1, None
-    if not samples.in_time or len(estimated) < _LAG_IMAGES or not np.isfinite(known).all() or not known.any():
+    contacts = [part for part in _contacts(samples) if samples.started[part.start]]
+    images = sum(part.stop - part.start for part in contacts)
+    if not samples.in_time or images < _LAG_IMAGES or not np.isfinite(known).all() or not known.any():
         return none
-    contacts = _contacts(samples)
 
     def residuals(unknown: Array) -> Array:
         """Relative to the largest force, with a factor of its own for each contact."""
@@ -223,11 +260,11 @@ def _lag(samples: ForceSamples) -> tuple[float, float, float | None]:
     fits = [least_squares(residuals, [0.1, math.log(time)], bounds=bounds) for time in (0.03, 0.1, 0.5)]
     best = min(fits, key=lambda fit: float(fit.cost))
     # Neighbouring images share their error: one in ten counts.
-    count = len(estimated) / 10
+    count = images / 10
     left, plain = 2 * float(best.cost) + 1e-12, float((residuals(np.zeros(2)) ** 2).sum()) + 1e-12
     covariance = left / count * np.linalg.pinv(best.jac.T @ best.jac)
     creep, deviation = float(best.x[0]), float(np.sqrt(covariance[0, 0]))
-    if count * math.log(plain / left) - 2 * math.log(len(estimated)) < _LAG_EVIDENCE or creep < 2 * deviation:
+    if count * math.log(plain / left) - 2 * math.log(images) < _LAG_EVIDENCE or creep < 2 * deviation:
         return none
     # During a shorter contact a lag looks like a factor, for example that of a wrong thickness.
     time = math.exp(best.x[1])
@@ -241,10 +278,13 @@ def _contacts(samples: ForceSamples) -> list[slice]:
 
 
 def _lagging(samples: ForceSamples, force: Array, creep: float, time: float) -> Array:
-    """Measured forces [N] as the deformation follows them."""
+    """Measured forces [N] as the deformation follows them, from equilibrium where the start was not seen."""
     if not creep:
         return force
-    parts = [_after_rest(force[part], samples.stamp[part], creep, time) for part in _contacts(samples)]
+    parts = []
+    for part in _contacts(samples):
+        follow = _after_rest if samples.started[part.start] else deformation
+        parts.append(follow(force[part], samples.stamp[part], creep, time))
     return np.concatenate(parts)
 
 

@@ -46,7 +46,8 @@ class TrackingSummary:
         self._valid.append(float(tracked.valid.mean()))
         self._inferred.append(float(tracked.inferred.mean()))
         measured = np.where(tracked.valid[:, None], tracked.displacement, np.nan)
-        self._newest = [*self._newest[-2:], measured]
+        # Positions, because displacements of the first images contain the noise of a reference that changes.
+        self._newest = [*self._newest[-2:], np.where(tracked.valid[:, None], tracked.position, np.nan)]
         if len(self._newest) == 3:
             noise = _noise(self._newest[0] - 2 * self._newest[1] + self._newest[2], tracked.position)
             self._noise += [] if noise is None else [noise]

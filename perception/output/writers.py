@@ -43,8 +43,8 @@ class TrackedImage:
     number: int  # from 0
     frame: SourceImage
     tracked: TrackingResult
-    position_mm: Floats | None = None  # on the gel [mm], shape (markers, 2); None without a calibration
-    displacement_mm: Floats | None = None  # [mm], shape (markers, 2); None without a calibration
+    position_mm: Floats | None = None  # on the gel [mm], shape (markers, 2); None without a scale
+    displacement_mm: Floats | None = None  # [mm], shape (markers, 2); None without a scale
     force: ForceEstimate | None = None  # in the axes of the image; None without a gel, or if it is not known
     slip: SlipEstimate | None = None  # None where the force is
 

@@ -17,7 +17,7 @@ SCENE, MODEL = "scene.toml", "insertion.xml"
 _ELASTIC = ("ks", "kt")  # in the table of the friction law
 _HEADING = (
     "# The scene `insertion` with the values that gelflow calibrate has found for: {names}.\n"
-    "# All other values, part and hole are those of the shipped scene.\n"
+    "# All other values, part and hole are those of the included scene.\n"
 )
 
 

@@ -21,6 +21,7 @@ from gelflow.task import InsertionTask
 
 AT_REST = 0.05  # time that a simulated descent rests before the reading: a robot descends ten times more slowly [s]
 _HEIGHT = 0.3e-3  # standard deviation of a part's height in the gripper, per attempt [m]
+_ATTEMPT_KEYS = ("insertion", "attempt", "outcome", "planar_pose", "depth", "contact")  # that are read
 
 
 def read_recordings(
@@ -34,8 +35,8 @@ def read_recordings(
     Insertions are numbered over all sessions. `part` is the part of the sessions with the files of its meshes, which a
     session does not contain. `visible_markers` gives, from the description of a session, which printed markers of each
     pad its camera shows; the others, which the runner interpolates, are not compared. Raises UsageError when a session
-    is given twice or is of another part or set-up (printed markers, cameras, grasp), a value is not finite, its flow
-    maps are not in millimetres, or there is no attempt with contact.
+    is given twice or is of another part or set-up (printed markers, cameras, grasp), a value is missing or not finite,
+    its flow maps are not in millimetres, or there is no attempt with contact.
     """
     rows: list[dict[str, Any]] = []
     inserted: dict[int, np.ndarray[Any, Any]] = {}
@@ -188,6 +189,8 @@ def _attempts(
         if record.topic == "/decision":
             decisions[value.insertion, value.attempt] = value
             continue
+        if missing := [key for key in _ATTEMPT_KEYS if key not in value]:
+            raise UsageError(f"{path}: a record of /attempt has no {', '.join(missing)}; was it recorded by gelflow?")
         insertion = first + int(value["insertion"])
         planar = np.array(value["planar_pose"], dtype=float)
         if value["outcome"] == "inserted":

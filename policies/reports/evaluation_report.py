@@ -22,6 +22,7 @@ from gelflow.sim.tasks.gripper.flow_map_noise import FlowMapNoise
 from gelflow.sim.tasks.task_batch import TaskBatch
 
 RESULTS, EPISODES, FAILURES, FAILURE_PICTURE = "results.json", "episodes.csv", "failures.csv", "failures.png"
+FORMAT = 1  # of results.json
 _MAX_FRAMES = 200  # of a film
 _LAST_FRAME = 2000  # [ms]
 
@@ -95,7 +96,7 @@ def actors(network: Network, task: TaskBatch, *, seed: int) -> dict[str, BatchPo
     """The policies of an evaluation by the name of their row.
 
     The names are "policy", "oracle" if the task has one, and "random". A network of flow maps adds the policy under
-    noise and random corrections within the reach of the network.
+    noise and random corrections up to the largest of the network.
     """
     n = task.num_envs
     found: dict[str, BatchPolicy] = {"policy": network.batch_policy(n)}
@@ -106,7 +107,7 @@ def actors(network: Network, task: TaskBatch, *, seed: int) -> dict[str, BatchPo
         noisy = NoisyPolicy(network.batch_policy(n), FlowMapNoise(), n, insertion.sensors, seed)
         found["policy, noisy flow maps"] = noisy
         reach = np.asarray(network.reach) / np.asarray(insertion.action_scale)
-        random = {"random, policy's reach": RandomPolicy(n, reach, seed), **random}
+        random = {"random, largest correction": RandomPolicy(n, reach, seed), **random}
     if has_oracle(task):
         found["oracle"] = OraclePolicy(task)
     return found | random
@@ -137,7 +138,7 @@ def _write_tables(out: Path, episodes: Episodes, report: Report) -> list[Path]:
         columns = (*results, *episodes.quantities.values())
         writer.writerows(zip(*(column.tolist() for column in columns), strict=True))
     rows = [entry.to_json() for entry in report.failures]
-    values = {"results": [result.to_json() for result in report.results], "failures": rows}
+    values = {"format": FORMAT, "results": [result.to_json() for result in report.results], "failures": rows}
     (out / RESULTS).write_text(json.dumps(to_plain(values), indent=2) + "\n")
     if not rows:
         return [out / RESULTS, out / EPISODES]

@@ -10,7 +10,7 @@ from PIL import Image as Pictures
 from PIL import ImageSequence
 
 from gelflow.errors import UsageError
-from gelflow.policies.reports.evaluation_report import EPISODES, FAILURE_PICTURE, RESULTS
+from gelflow.policies.reports.evaluation_report import EPISODES, FAILURE_PICTURE, FORMAT, RESULTS
 from gelflow.policies.reports.failures import FailureRange, worst_ranges
 from gelflow.policies.reports.shown_episodes import Image, ShownEpisodes
 
@@ -41,7 +41,7 @@ class SavedEvaluation:
     def evaluate(self, progress: Callable[[str], None] = lambda text: None) -> ShownEpisodes | None:
         """The results, failures and films in the folder; None if nothing has changed since the last call.
 
-        Raises UsageError when a file cannot be read.
+        Raises UsageError when a file cannot be read or has a newer format.
         """
         newest = max((path.stat().st_mtime_ns for path in self.folder.iterdir()), default=0)
         if newest == self._read:
@@ -49,13 +49,14 @@ class SavedEvaluation:
         self._read = newest
         progress("reading the films")
         try:
-            values = json.loads((self.folder / RESULTS).read_text())
-            text = _text(values)
+            text = _text(_read_results(self.folder / RESULTS))
             failures = self.folder / FAILURE_PICTURE
             picture = np.asarray(Pictures.open(failures).convert("RGB")) if failures.is_file() else None
             found = {name: self.folder / f"{name}.gif" for name in ("success", "failure")}
             films = {name: _film(path) for name, path in found.items() if path.is_file()}
         except (LookupError, TypeError, ValueError, OSError) as error:
+            if isinstance(error, UsageError):
+                raise
             raise UsageError(f"{self.folder} cannot be read: {error}; run gelflow eval again") from error
         rate = max((rate for _, rate in films.values()), default=1.0)
         return ShownEpisodes(text, picture, {name: frames for name, (frames, _) in films.items()}, rate)
@@ -64,6 +65,15 @@ class SavedEvaluation:
 def is_evaluation(folder: Path) -> bool:
     """Whether the folder has the files of `gelflow eval --out`."""
     return (folder / RESULTS).is_file() and (folder / EPISODES).is_file()
+
+
+def _read_results(path: Path) -> dict[str, Any]:
+    """The contents of `results.json`. Raises UsageError when it has a newer format."""
+    values = dict(json.loads(path.read_text()))
+    version = values.get("format", 1)  # the first version wrote no number
+    if version > FORMAT:
+        raise UsageError(f"{path} has format {version}; this gelflow reads format {FORMAT}: update gelflow")
+    return values
 
 
 def _text(values: Mapping[str, Any]) -> str:

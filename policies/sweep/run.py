@@ -11,7 +11,6 @@ from gelflow.errors import UsageError
 
 FORMAT = 1
 GELFLOW = ("-P", "-m", "gelflow.cli")  # -P: a file in the working folder must not replace an imported module
-WRONG_INPUT = 2  # exit code of gelflow for an error that another start repeats
 
 
 @dataclass(frozen=True)
@@ -58,14 +57,9 @@ class RunRecord:
     starts: int = 0  # in this folder, by all sweeps
     machine: str = ""
     seconds: float = 0.0  # duration of the last start, wall time
-    exit_code: int | None = None  # negative: the number of the signal; None: unknown, its worker was lost
+    exit_code: int | None = None  # negative: the number of the signal; None: its worker was lost or could not start it
     error: str = ""
     result: dict[str, Any] = field(default_factory=dict)  # the JSON object that the command printed
-
-    @property
-    def start_again(self) -> bool:
-        """Whether another start may succeed: the run failed, and not because of wrong input."""
-        return self.state == "failed" and self.exit_code != WRONG_INPUT
 
 
 def read_record(run: Run) -> RunRecord:
@@ -85,14 +79,19 @@ def read_record(run: Run) -> RunRecord:
         if isinstance(error, UsageError):
             raise
         raise UsageError(
-            f"{run.record} is damaged ({type(error).__name__}); delete it to start its run again"
+            f"{run.record} is damaged ({type(error).__name__}); delete it and runs/{run.name} to start the run again"
         ) from error
-    if record.arguments != run.arguments:
+    check_arguments(run, record.arguments)
+    return record
+
+
+def check_arguments(run: Run, stored: tuple[str, ...]) -> None:
+    """Raises UsageError when the run of this name in the folder has other arguments, those in `stored`."""
+    if stored != run.arguments:
         raise UsageError(
-            f"{run.folder} holds a run {run.name!r} with other options: {_difference(record.arguments, run.arguments)};"
+            f"{run.folder} holds a run {run.name!r} with other options: {_difference(stored, run.arguments)};"
             " choose another --out"
         )
-    return record
 
 
 def write_record(run: Run, record: RunRecord) -> None:

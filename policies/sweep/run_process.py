@@ -16,7 +16,7 @@ from typing import IO, Any
 
 from gelflow.errors import UsageError
 from gelflow.policies.sweep import launcher
-from gelflow.policies.sweep.run import WRONG_INPUT, Run, RunRecord, read_record, write_record
+from gelflow.policies.sweep.run import Run, RunRecord, read_record, write_record
 from gelflow.policies.training.folder import try_lock
 
 _POLL = 0.1  # interval of looking at the process [s, wall]
@@ -25,14 +25,17 @@ _WITH_RESULT = (0, 1)  # exit codes of a command that ran to its end; 1: with a 
 
 
 def execute(run: Run, machine: str = "") -> RunRecord:
-    """Start a run and wait until it ends; the entry point of workers. Returns at once when the run is complete."""
+    """Start a run and wait until it ends; the entry point of workers. Returns at once when the run is complete.
+
+    The record of a run that this machine cannot start has the reason and no exit code, and is not written.
+    """
     try:
         with RunProcess(run, machine) as process:
             while (record := process.poll()) is None:
                 time.sleep(_POLL)
             return record
     except UsageError as error:
-        return RunRecord(run.name, run.arguments, "failed", machine=machine, exit_code=WRONG_INPUT, error=str(error))
+        return RunRecord(run.name, run.arguments, "failed", machine=machine, error=str(error))
 
 
 class RunProcess:
@@ -67,8 +70,8 @@ class RunProcess:
             record = read_record(self._run)
             if record.state == "complete":  # by the process that had the lock
                 return record
-            if record.exit_code is None and (result := _json_object(self._run.output)) is not None:
-                # It ended after its worker was lost.
+            if record.starts and record.exit_code is None and (result := _json_object(self._run.output)) is not None:
+                # It ended after its worker was lost. The output of a run without starts is not of this record.
                 return self._complete(dataclasses.replace(record, exit_code=0), result)
             self._start(dataclasses.replace(record, starts=record.starts + 1))
             return None

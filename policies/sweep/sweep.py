@@ -18,7 +18,7 @@ Report = Callable[[Run, RunRecord, bool], None]  # a run that ended, its record,
 
 
 @contextlib.contextmanager
-def sweep_folder(folder: Path, grid_file: Path) -> Iterator[None]:
+def sweep_folder(folder: Path) -> Iterator[None]:
     """Prepare the folder of a sweep and keep it locked for this process.
 
     Raises UsageError when it cannot be written, or another sweep uses it.
@@ -36,9 +36,13 @@ def sweep_folder(folder: Path, grid_file: Path) -> Iterator[None]:
         lock.truncate(0)
         lock.write(f"process {os.getpid()} on {platform.node()}\n")
         lock.flush()
-        if grid_file.resolve() != (folder / "grid.toml").resolve():
-            shutil.copyfile(grid_file, folder / "grid.toml")
         yield
+
+
+def store_grid_file(folder: Path, grid_file: Path) -> None:
+    """Copy the grid file into the folder of its sweep."""
+    if grid_file.resolve() != (folder / "grid.toml").resolve():
+        shutil.copyfile(grid_file, folder / "grid.toml")
 
 
 def incomplete(runs: Sequence[Run]) -> list[Run]:
@@ -53,21 +57,29 @@ def execute_runs(runs: Sequence[Run], engine: Engine, *, tries: int, report: Rep
     ----------
     runs: those that are not complete
     engine: executes them
-    tries: starts of a run; one that ends with an error of its input is not started again
+    tries: starts of a run. No exit code excludes another start: a full disk has the same one as wrong input.
     report: called for each run that ended
     """
     tried = Counter({run.name: 1 for run in runs})
     remaining = len(runs)
     engine.submit(runs)
     while remaining:
-        for run, record in engine.ended():
-            if record.exit_code is None:  # the worker could not write it
-                record = dataclasses.replace(read_record(run), state="failed", error=record.error)
-                write_record(run, record)
-            again = record.start_again and tried[run.name] < tries
+        for run, ended in engine.ended():
+            record = ended if ended.exit_code is not None else _without_worker(run, ended.error)
+            again = record.state == "failed" and tried[run.name] < tries
             report(run, record, again)
             if again:
                 tried[run.name] += 1
                 engine.submit([run])
             else:
                 remaining -= 1
+
+
+def _without_worker(run: Run, error: str) -> RunRecord:
+    """Write the record of a run whose worker was lost or could not start it; one that is complete stays complete."""
+    record = read_record(run)
+    if record.state == "complete":
+        return record
+    record = dataclasses.replace(record, state="failed", error=error)
+    write_record(run, record)
+    return record

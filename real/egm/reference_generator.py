@@ -219,7 +219,9 @@ class ReferenceGenerator:
         remaining = max(distance / target.speed, angle / target.turn_speed)
         if remaining == 0.0:
             return (target.position, target.quaternion), False
-        remaining *= self._joint_stretch(reference, move, turn, min(1.0, cycle / remaining))
+        # The rest may take less than a cycle, and is stretched from a whole one.
+        stretch = self._joint_stretch(reference, move, turn, min(1.0, cycle / remaining))
+        remaining = max(remaining, cycle) * stretch if stretch > 1.0 else remaining
         # Accelerate from rest to full rate in ramp_time; decelerate equally to rest at the target.
         rate = min(1.0, self._rate + cycle / ramp, math.sqrt(2 * remaining / ramp))
         advance = min(rate * cycle, self._allowed_advance(reference, move, turn, remaining))

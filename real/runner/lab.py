@@ -256,7 +256,7 @@ class WorkspaceSettings:
     x: float = LIMITS.workspace_x  # largest |x| in the hole frame [m]
     y: float = LIMITS.workspace_y  # largest |y| [m]
     yaw_deg: float = LIMITS.workspace_yaw_deg  # largest |yaw| [°]
-    tilt_deg: float = LIMITS.workspace_tilt_deg  # largest angle between the z axes of gripper and base [°]
+    tilt_deg: float = LIMITS.workspace_tilt_deg  # largest angle between the z axes of gripper and hole [°]
     height_min: float = LIMITS.workspace_height[0]  # lowest lower face above the hole's floor [m]
     height_max: float = LIMITS.workspace_height[1]  # highest lower face [m]
     max_step: float = LIMITS.target_distance  # largest distance from the arm to a target [m]

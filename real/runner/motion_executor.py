@@ -16,6 +16,7 @@ from gelflow.protocols import ArmState, Camera, Gripper, GripperState
 from gelflow.real.egm.cycle_log import EgmCycle
 from gelflow.real.egm.driver import EgmArm
 from gelflow.real.egm.reference_generator import EgmFlag
+from gelflow.real.limits import LIMITS
 from gelflow.real.runner.checks import DataChecks
 from gelflow.real.runner.lab import Lab
 from gelflow.real.runner.phases import with_advice
@@ -27,6 +28,9 @@ RECORD_EVERY = 5  # EGM cycles: poses are recorded at 50 Hz, and in addition at 
 _HISTORY = 8192  # number of measured heights kept, one per cycle: 32 s
 ARRIVED = (0.1e-3, math.radians(0.1))  # distance from the target at which a move has ended [m, rad]
 _PROGRESS = 0.1  # reduction of the remaining motion that counts as progress, as a fraction of ARRIVED
+# Time without an observation of the pads after which a guarded motion holds [s]: 250 ms, less the longest wait of the
+# observer and tracking.
+LONGEST_UNOBSERVED = LIMITS.image_age - 0.03
 _WIDTH_CHANGE = 0.5e-3  # of the gripper since the grasp, above which the part has moved [m]
 _BLOCKED_AFTER = 3.0  # without progress [s]
 _WATCH_PERIOD = 0.004  # of the checks of all data, one cycle of EGM [s]
@@ -75,9 +79,11 @@ class MotionExecutor:
         self._lock = threading.Lock()
         self._goal: Pose | None = None
         self._speeds = (lab.arm.max_speed, math.radians(lab.arm.max_turn_speed_deg))
+        self._observe_until = math.inf  # until then a caller must observe the pads again [s]
+        self._unobserved = False  # a caller did not, and the arm holds
         self._part_lock = threading.Lock()  # of the following three; taken before `_lock`
         self._part_expected = False
-        self._held_width = math.nan  # of the gripper at the grasp [m]
+        self._held: GripperState | None = None  # the gripper at the grasp
         self._part_lost = ""  # the evidence that the part was lost
         self._requested_stop = ""  # the reason, after `request_stop`
         self._ending = threading.Event()
@@ -121,8 +127,9 @@ class MotionExecutor:
         """Start a straight motion of the gripper frame to `target` and return.
 
         Speeds [m/s], [rad/s]; None: those of the lab file. `guarded` states that the caller observes both pads until
-        the end of the motion, as `GuardedMotion` does. Raises SafetyError when the supervisor refuses the target, when
-        the phase allows no motion, and when a part is held and the motion is not guarded; the arm then holds.
+        the end of the motion, as `GuardedMotion` does, and calls `observed` each time. Raises SafetyError when the
+        supervisor refuses the target, when the phase allows no motion, and when a part is held and the motion is not
+        guarded; the arm then holds.
         """
         self._raise_failure()
         self.supervisor.phases.require_motion()
@@ -135,6 +142,8 @@ class MotionExecutor:
                 self._check_requested_stop()
                 self._post(target, speeds)
                 self._goal, self._speeds = target, speeds
+                self._observe_until = self._clock.now() + LONGEST_UNOBSERVED if guarded else math.inf
+                self._unobserved = False
         except SafetyError:
             self.hold()
             raise
@@ -142,6 +151,15 @@ class MotionExecutor:
         tool = self._lab.tool_pose(target)
         self._recorder.arm_command(stamp, tool.position, tool.quaternion, kind="command")
         self._recorder.event("move", {"speed": speeds[0], "turn_speed": speeds[1], "position": tool.position})
+
+    def observed(self) -> bool:
+        """The caller of a guarded motion has observed the pads just now.
+
+        Returns False when the arm holds because this took too long: `go` continues.
+        """
+        with self._lock:
+            self._observe_until = self._clock.now() + LONGEST_UNOBSERVED
+            return not self._unobserved
 
     def hold(self) -> None:
         """Give up the target and come to rest; see `EgmArm.hold`."""
@@ -172,14 +190,18 @@ class MotionExecutor:
         """Wait for `seconds` of robot time. Raises the failure of the thread, or PartLost."""
         self._clock.sleep(seconds)
         self._raise_failure()
+        self._check_requested_stop()
         if self._part_lost:
             raise PartLost(self._part_lost)
 
     def expect_part(self, held: bool) -> None:
-        """Set whether a part is held from now on. When it is lost, the arm holds and `wait` raises PartLost."""
-        width = self._gripper.state().width
+        """Set whether a part is held from now on. When it is lost, the arm holds and `wait` raises PartLost.
+
+        A part is lost when the width of the grip or the grasp state changes from what the gripper reports now.
+        """
+        state = self._gripper.state()
         with self._part_lock:
-            self._part_lost, self._held_width, self._part_expected = "", width, held
+            self._part_lost, self._held, self._part_expected = "", state, held
 
     def height_at(self, stamp: float) -> float:
         """Measured height of the gripper frame in the base frame at a robot time [m]."""
@@ -223,6 +245,7 @@ class MotionExecutor:
             try:
                 self._watch()
                 now = self._clock.now()
+                self._hold_unobserved(now)
                 with self._lock:
                     goal, speeds = self._goal, self._speeds
                     if goal is not None and now >= due:
@@ -248,6 +271,15 @@ class MotionExecutor:
         self.checks.test()
         self.watch_part()
 
+    def _hold_unobserved(self, now: float) -> None:
+        """Hold when the caller of a guarded motion has not observed the pads in time: its thread has stalled."""
+        with self._lock:  # together with the test, so that no `go` comes in between
+            if self._goal is None or now <= self._observe_until or self.arrived():
+                return
+            self._unobserved, self._goal = True, None
+            self._arm.hold()
+        self._recorder.event("pads not observed", {"seconds": LONGEST_UNOBSERVED})
+
     def _check_requested_stop(self) -> None:
         if self._requested_stop:
             raise SafetyError(with_advice(f"stopped: {self._requested_stop}"))
@@ -259,9 +291,10 @@ class MotionExecutor:
                 self._compare_grasp(self._gripper.state())
 
     def _compare_grasp(self, gripper: GripperState) -> None:
-        change = gripper.width - self._held_width
-        if gripper.grasp in ("part lost", "no part"):
-            self._part_lost = "the gripper reports that the part was lost"
+        assert self._held is not None
+        change = gripper.width - self._held.width
+        if gripper.grasp != self._held.grasp:
+            self._part_lost = f"the gripper reports {gripper.grasp}, and {self._held.grasp} before"
         elif abs(change) > _WIDTH_CHANGE:
             self._part_lost = f"the grip width changed by {1e3 * change:+.2f} mm since the grasp: the part moved"
         if self._part_lost:
@@ -310,7 +343,7 @@ class MotionExecutor:
             self._recorder.arm_command(record.stamp, record.applied[0], record.applied[1], kind="applied")
 
     def _fail(self, error: Exception) -> None:
-        """Hold within this cycle, then stop. The gripper is not opened and no power is cut, so the part stays held."""
+        """Hold within this cycle, then stop, the fingers too unless they hold a part: that stays held."""
         known = isinstance(error, GelflowError)
         self.failure = error if isinstance(error, GelflowError) else PeerError(f"{type(error).__name__}: {error}")
         reason = str(self.failure)
@@ -318,6 +351,7 @@ class MotionExecutor:
             self.hold,
             lambda: self.supervisor.latch(reason),
             lambda: self._arm.stop(reason),
+            self._stop_empty_fingers,
             self._log,
             lambda: self._record_checks(self._clock.now(), always=True),
         ):
@@ -326,6 +360,10 @@ class MotionExecutor:
                 action()
         with contextlib.suppress(GelflowError):
             self._recorder.event("stopped", {"reason": str(self.failure), "expected": known})
+
+    def _stop_empty_fingers(self) -> None:
+        if not self._part_expected and self._gripper.state().grasp != "holding":
+            self._gripper.stop()
 
     def _raise_failure(self) -> None:
         if self.failure is not None:

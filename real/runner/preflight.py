@@ -44,7 +44,7 @@ def run_preflight(cell: Cell, supervisor: Supervisor) -> list[PreflightItem]:
     checks = [*robot, *cameras] if cell.dry_run else [*cameras, *robot]
     items = [_result(name, check) for name, check in checks]
     if all(item.good for item in items) and not cell.dry_run:
-        items[-1] = _result("gripper", lambda: _homed(cell))
+        items[-1] = _result("gripper", lambda: _homed(cell, supervisor))
     cell.recorder.event("preflight", {item.name: {"good": item.good, "text": item.text} for item in items})
     if failed := [f"{item.name}: {item.text}" for item in items if not item.good]:
         raise SafetyError(f"preflight failed: {'; '.join(failed)}")
@@ -129,7 +129,9 @@ def _gripper(cell: Cell) -> str:
     return "not homed: a run homes it outwards after these checks"
 
 
-def _homed(cell: Cell) -> str:
+def _homed(cell: Cell, supervisor: Supervisor) -> str:
+    if supervisor.latched:  # the stop button
+        raise SafetyError(f"not homed: {supervisor.latched}")
     if not cell.gripper.state().referenced:
         cell.gripper.home()
     return _gripper(cell)

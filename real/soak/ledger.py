@@ -14,10 +14,13 @@ FORMAT = 1
 
 
 class Ledger:
-    """The rows of a soak test. Raises UsageError when the file cannot be read or was written by another program."""
+    """The rows of a soak test; `settings` are the options of its plans, which are part of each row.
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
+    Raises UsageError when the file cannot be read, was written by another program, or has rows of other settings.
+    """
+
+    def __init__(self, path: Path, **settings: object) -> None:
+        self._path, self._settings = path, settings
         self.rows: dict[int, dict[str, Any]] = {}  # by seed
         try:
             lines = path.read_bytes().split(b"\n") if path.exists() else []
@@ -33,12 +36,15 @@ class Ledger:
                 known = False
             if not known:
                 raise UsageError(f"{path}, line {number}, is not a row of a soak test; name another folder with --out")
+            for key, value in settings.items():
+                if row.get(key) != value:
+                    raise UsageError(f"{path} has plans with {key} {row.get(key)}, not {value}; name another --out")
         if lines and lines[-1]:
             self._cut(len(lines[-1]))
 
     def add(self, seed: int, row: Mapping[str, Any]) -> None:
         """Add the row of a seed, or replace it by a later one; it is on the disk when this returns."""
-        whole = {"format": FORMAT, "seed": seed, **to_plain(row)}
+        whole = {"format": FORMAT, "seed": seed, **to_plain(self._settings), **to_plain(row)}
         try:
             with self._path.open("ab") as file:
                 file.write(json.dumps(whole, allow_nan=False, separators=(",", ":")).encode() + b"\n")

@@ -35,6 +35,7 @@ from gelflow.real.wsg.state import StateAssembler
 _log = logging.getLogger(__name__)
 _log.addHandler(logging.NullHandler())  # silent unless the program configures logging
 _WSG_50 = 1  # device type
+_IN_MOTION = ("grasping", "releasing", "positioning")  # grasp states while the fingers move
 _FORCE_TOLERANCE = 0.5  # between the requested and the confirmed force limit [N]
 
 _MEANING = {
@@ -141,14 +142,15 @@ class WsgGripper:
             return
         _log.info("disconnecting from the gripper at %s: %s", link.address, reason)
         with self._changed:
-            held = self._values.complete and self._holds(self._values.state(corrupt=False))
+            state = self._values.state(corrupt=False) if self._values.complete else None
+        held = state is not None and self._holds(state) and state.grasp not in _IN_MOTION
         try:
             commands = [("disconnect", Command.DISCONNECT)]
             if (self._moving.locked() or not held) and not self._config.dry_run:
                 commands.insert(0, ("stop", Command.STOP))
             for name, command in commands:
                 try:
-                    link.request(Packet(command), urgent=True)
+                    link.request(Packet(command), urgent=command == Command.STOP)
                     self._record(name, {})
                 except GelflowError as error:
                     _log.error("%s while disconnecting from the gripper: %s", name, error)
@@ -197,8 +199,9 @@ class WsgGripper:
     def move(self, *, width: float, speed: float) -> None:
         """Move the empty fingers to `width` [m] at `speed` [m/s]; returns when they have arrived.
 
-        Raises SafetyError outside the limits or while a part may be held, UsageError when it takes longer than the
-        time-out, PeerRefused when the fingers are blocked, PeerTimeout and PeerError as every command.
+        They close with the smallest force limit. Raises SafetyError outside the limits or while a part may be held,
+        UsageError when it takes longer than the time-out, PeerRefused when the fingers are blocked, PeerTimeout and
+        PeerError as every command.
         """
         state = self._ready("move")
         check_limits(self._limits, width=width, speed=speed)
@@ -210,7 +213,8 @@ class WsgGripper:
             )
         check_duration(state, width, speed, self._config.move_timeout)
         packet = codec.pre_position(width, speed)
-        self._move("move", {"width": width, "speed": speed}, packet, self._config.move_timeout)
+        force = self._limits.force[0] if width < state.width else None  # a hand may be between the fingers
+        self._move("move", {"width": width, "speed": speed}, packet, self._config.move_timeout, force=force)
         self._settle(lambda s: s.grasp != "positioning", "done positioning")
         self._grasped = False
 
@@ -367,9 +371,7 @@ class WsgGripper:
         link.request(codec.set_force_limit(force))
         (confirmed,) = link.request(Packet(Command.GET_FORCE_LIMIT)).values()
         if abs(confirmed - force) > _FORCE_TOLERANCE:
-            raise PeerRefused(
-                f"the gripper limits its force to {confirmed:.1f} N, expected {force:.1f} N: not grasping"
-            )
+            raise PeerRefused(f"the gripper limits its force to {confirmed:.1f} N, expected {force:.1f} N: not moving")
 
     def _stop(self, name: str, command: Command) -> None:
         link = self._connected()
@@ -382,7 +384,9 @@ class WsgGripper:
     def _stop_after(self, name: str, reason: str) -> None:
         """Stop because `name` failed. Errors of the stop are logged, so that the first error is the one raised."""
         _log.error("stopping the gripper: %s failed (%s)", name, reason)
-        try:
-            self._stop("stop", Command.STOP)
-        except GelflowError as error:
-            _log.error("the stop was not confirmed: %s", error)
+        for _ in range(2):  # a damaged command is not executed
+            try:
+                self._stop("stop", Command.STOP)
+                return
+            except GelflowError as error:
+                _log.error("the stop was not confirmed: %s", error)

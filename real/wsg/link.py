@@ -92,13 +92,15 @@ class WsgLink:
         self._fail(PeerError(f"the link to the gripper at {self.address} is closed"))
 
     def request(self, packet: Packet, *, urgent: bool = False) -> Reply:
-        """Send a command that is answered once; returns its successful reply.
+        """Send a command that is not a motion; returns its successful reply.
 
         `urgent` skips the pause between commands. Raises PeerTimeout, PeerRefused or PeerError.
         """
         with self._inbox(Command(packet.id)) as inbox:
             self._send(packet, urgent=urgent)
             reply = self._take(inbox, packet, self._reply_timeout)
+            if reply.status == Status.CMD_PENDING:  # some firmware first acknowledges a stop
+                reply = self._take(inbox, packet, self._reply_timeout)
         if reply.status != Status.SUCCESS:
             text = f"the gripper answered {reply.command.name} with {reply.status.name}"
             raise WsgRefused(text, status=reply.status)

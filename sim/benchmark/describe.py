@@ -99,7 +99,7 @@ class PadPart:
     markers: int
     rows: int | None  # None without a grid
     cols: int | None
-    pitch: float | None  # [mm]
+    pitch_mm: float | None
     against: tuple[str, ...]
     law: str
     unit: str
@@ -180,7 +180,7 @@ def describe(scene: Scene) -> Description:
                 markers=len(pad.positions),
                 rows=pad.grid.rows if pad.grid else None,
                 cols=pad.grid.cols if pad.grid else None,
-                pitch=pad.grid.pitch if pad.grid else None,
+                pitch_mm=pad.grid.pitch if pad.grid else None,
                 against=pad.against,
                 law=pad.law,
                 unit="per point" if (pad.weights == 1).all() else "per area",

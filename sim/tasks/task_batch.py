@@ -163,7 +163,7 @@ class TaskBatch(ABC):
         """A picture of environment `index`, scene and pads; shape (height, width, 3)."""
 
     def _mask(self, which: ArrayLike) -> Mask:
-        mask = np.asarray(which)
+        mask = np.array(which)  # a copy: `which` may be a result of the batch, which changes
         if mask.shape != (self.num_envs,) or mask.dtype != bool:
             raise UsageError(f"a mask of environments must be ({self.num_envs},) bool, got {mask.shape} {mask.dtype}")
         return mask

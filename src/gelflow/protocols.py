@@ -86,8 +86,20 @@ class Arm(Protocol):
         """The newest measured state."""
         ...
 
-    def target(self, position: NDArray[np.float64], quaternion: NDArray[np.float64], *, lifetime: float) -> None:
-        """Set the reference of the tool: position [m], shape (3,), and quaternion w x y z, shape (4,)."""
+    def target(
+        self,
+        position: NDArray[np.float64],
+        quaternion: NDArray[np.float64],
+        *,
+        lifetime: float,
+        speed: float | None = None,
+        turn_speed: float | None = None,
+    ) -> None:
+        """Set the reference of the tool: position [m], shape (3,), and quaternion w x y z, shape (4,).
+
+        `speed` [m/s] and `turn_speed` [rad/s] lower the driver's own limits. Raises SafetyError for a target beyond
+        the limits; it is never clamped.
+        """
         ...
 
     def hold(self) -> None:
@@ -96,6 +108,10 @@ class Arm(Protocol):
 
     def stop(self, reason: str) -> None:
         """Stop sending, so that the controller's own time limit ends the motion. Latched until `reset`."""
+        ...
+
+    def reset(self) -> None:
+        """Allow motion again after a stop, on the operator's command."""
         ...
 
     def close(self) -> None: ...

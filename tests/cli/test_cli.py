@@ -222,6 +222,18 @@ def test_a_name_that_is_too_long_is_an_error_of_one_line(
         (["mock", "--seed", "-1"], "--seed must be at least 0, got -1"),
         (["describe", "insertion", "--repeats", "0"], "--repeats must be at least 1, got 0"),
         (["track", "none", "--out", "film.gif"], "--out film.gif: the suffix must be one of .csv, .mcap, .mp4"),
+        (["track", "none", "--port", "0"], "--port is for the page of --show; add --show"),
+        (["run", "insertion", "--lab", "none", "--host", "0.0.0.0"], "--host is for the page of --view; add --view"),
+        (["demo", "--port", "0"], "--port is for the page of --view; add --view"),
+        (["recover", ""], "cannot open .: Is a directory"),
+        (["recover", "."], "cannot open .: Is a directory"),
+        (["recover", "/"], "cannot open /: Is a directory"),
+        (["export", ""], ". is no checkpoint"),
+        (["export", "."], ". is no checkpoint"),
+        (["mock", "--truth-port", "70000"], "truth port must be within 0 to 65535, got 70000"),
+        (["mock", "--truth-port", "-1"], "truth port must be within 0 to 65535, got -1"),
+        (["mock", "--tcp-port", "70000"], "tcp port must be within 0 to 65535, got 70000"),
+        (["tradeoff", "pushing", "--out", "a.foo"], "--out a.foo: the suffix must be one of .png, .jpg"),
     ],
 )
 def test_wrong_options_exit_with_2_and_one_line(

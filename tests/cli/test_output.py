@@ -20,6 +20,16 @@ def test_square_brackets_are_printed(capsys: pytest.CaptureFixture[str]) -> None
         assert text in printed
 
 
+def test_the_colons_of_an_address_are_no_emoji(capsys: pytest.CaptureFixture[str]) -> None:
+    output = Output(width=60)
+    output.text("open http://[fd00:a:b::5]:8080 in a browser")
+    table = Table("address")
+    table.add_row("tcp:[fd00:a:b::6]:1000")
+    output.console.print(table)
+    printed = capsys.readouterr().out
+    assert "http://[fd00:a:b::5]:8080" in printed and "tcp:[fd00:a:b::6]:1000" in printed
+
+
 def test_checks_are_a_table_of_ok_and_no(capsys: pytest.CaptureFixture[str]) -> None:
     Output(width=60).console.print(
         preflight_table([PreflightItem("arm", True, "EGM"), PreflightItem("[left]", False, "none")])

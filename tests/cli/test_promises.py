@@ -98,6 +98,11 @@ def test_seeds_of_the_scenarios_differ() -> None:
         (["--promises", "--only", "contct"], "there is no promise 'contct'"),
         (["--only", "contact"], "--only is the seed of a plan"),
         (["--egm", "0"], "--egm must be above 0"),
+        (["--promises", "--plans", "5"], "--plans is for random plans, and --promises runs none"),
+        (["--promises", "--preset", "fast"], "--preset is for random plans, and --promises runs none"),
+        (["--egm", "1", "--factor", "4"], "--factor is for random plans, and --egm runs none"),
+        (["--egm", "1", "--only", "contact"], "--only names a plan or a promise, and --egm runs none"),
+        (["--egm", "1", "--promises"], "--promises and --egm are different tests"),
     ],
 )
 def test_invalid_options_give_a_one_line_error(

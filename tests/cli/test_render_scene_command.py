@@ -1,4 +1,4 @@
-"""`gelflow render-scene`: films and pictures of shipped scenes and of bare model files."""
+"""`gelflow render-scene`: films and pictures of included scenes and of bare model files."""
 
 import json
 from collections.abc import Iterator
@@ -48,7 +48,11 @@ def test_picture_of_a_bare_model(tmp_path: Path) -> None:
         (["--out", "film.gif"], "--out must end in"),
         (["--out", "no/such/folder/film.mp4"], "there is no folder"),
         (["--size", "big"], "--size must be width x height"),
-        (["--fps", "0"], "--fps must be above 0"),
+        (["--fps", "0"], "--fps must be within 0.01 to 240, got 0"),
+        (["--fps", "1000"], "--fps must be within 0.01 to 240, got 1000"),
+        (["--fps", "0.001"], "--fps must be within 0.01 to 240, got 0.001"),
+        (["--fps", "nan"], "--fps must be within 0.01 to 240, got nan"),
+        (["--speed", "0"], "--speed must be above 0"),
         (["--seconds", "-1"], "--seconds must be at least 0"),
         (["--controls", "missing.npy"], "cannot read missing.npy"),
         (["--camera", "behind"], "no view 'behind'"),

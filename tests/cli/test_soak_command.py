@@ -69,6 +69,59 @@ def test_a_mock_robot_that_never_starts_ends_the_soak_test(
     assert "3 plans in sequence did not run" in capsys.readouterr().err
 
 
+@pytest.fixture
+def failing_starts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No mock robot starts."""
+
+    def run(case: SoakCase, keep: Path | None = None) -> dict[str, Any]:
+        raise PeerError("the mock robot did not start")
+
+    monkeypatch.setattr(SoakCase, "run", run)
+
+
+@pytest.mark.usefixtures("failing_starts")
+def test_plans_that_did_not_run_are_named_and_are_no_success(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["soak", "--plans", "2", "--out", str(tmp_path), "--json"]) == 1
+    result = json.loads(capsys.readouterr().out)
+    assert result["plans"] == 0 and result["not_run"] == [0, 1]
+    assert main(["soak", "--plans", "2", "--out", str(tmp_path)]) == 1
+    assert "not run: 0 1" in capsys.readouterr().out
+
+
+def test_one_plan_that_does_not_run_is_an_error(
+    tmp_path: Path, cases: list[int], request: pytest.FixtureRequest, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In a new folder, and where the folder contains an earlier result of the plan."""
+    assert main(["soak", "--only", "1", "--out", str(tmp_path / "used")]) == 0
+    request.getfixturevalue("failing_starts")
+    for folder in ("new", "used"):
+        capsys.readouterr()
+        assert main(["soak", "--only", "1", "--out", str(tmp_path / folder)]) == 2
+        assert "plan 1 did not run: the mock robot did not start" in capsys.readouterr().err
+    assert cases == [1]
+
+
+@pytest.mark.parametrize(
+    ("options", "changed"),
+    [
+        (["--factor", "4"], "factor 2.0, not 4.0"),
+        (["--jitter", "0.3"], "jitter 0.1, not 0.3"),
+        (["--preset", "fast"], "preset None, not fast"),
+    ],
+)
+def test_a_soak_test_with_other_settings_needs_another_folder(
+    tmp_path: Path, cases: list[int], options: list[str], changed: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["soak", "--plans", "1", "--out", str(tmp_path)]) == 0
+    capsys.readouterr()
+    assert main(["soak", "--plans", "2", "--out", str(tmp_path), *options]) == 2
+    error = capsys.readouterr().err
+    assert f"has plans with {changed}; name another --out" in error and error.count("\n") == 1
+    assert cases == [0]
+
+
 def test_a_refused_world_is_a_row_of_its_own(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -20,7 +20,7 @@ from gelflow.perception.camera_calibration import load_calibration
 from gelflow.perception.frames import CameraMount
 from gelflow.perception.output.summary import TrackingSummary
 from gelflow.perception.output.writers import TrackedImage
-from gelflow.perception.sources import SourceImage
+from gelflow.perception.sources import ImageSource, SourceImage
 from gelflow.perception.synthetic.appearance import GelAppearance
 from gelflow.perception.synthetic.fast_renderer import FastGelRenderer
 from gelflow.perception.tracker import TrackingResult
@@ -199,6 +199,29 @@ def test_a_failed_start_saves_a_picture_and_no_empty_files(tmp_path: Path, capsy
         assert not file.exists()
 
 
+def test_a_live_source_may_begin_with_black_images(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    renderer = FastGelRenderer(LOOK)
+    black = np.full((320, 240, 3), 3, dtype=np.uint8)
+    pictures = [black, black, *(renderer.render(field(number), sequence=number) for number in range(4))]
+    images = [SourceImage(f"{number:06d}", picture, number / 25) for number, picture in enumerate(pictures)]
+    with monkeypatch.context() as patch:
+        patch.setattr(ImageSource, "_from_capture", lambda source: iter(images))
+        assert main(["track", "0", "--images", "3", "--out", "t.csv", "--json"]) == 0
+        result = json.loads(capsys.readouterr().out)
+        assert main(["calibrate-camera", "0", "--spacing-mm", "2.2", "--out", "fit.json"]) == 0
+    assert result["images"] == 3 and result["unreadable_images"] == 2
+    assert result["first_unreadable"].startswith("image 000000: ")
+    assert [row["image"] for row in rows_of(Path("t.csv"))[::48]] == ["000002", "000003", "000004"]
+    assert load_calibration(Path("fit.json")).residual_px < 0.1
+    seconds = [SourceImage(f"{number}", black, float(number)) for number in range(9)]
+    monkeypatch.setattr(ImageSource, "_from_capture", lambda source: iter(seconds))
+    assert main(["track", "0", "--out", "u.csv"]) == 2
+    assert "u-refused.png" in capsys.readouterr().err and not Path("u.csv").exists()
+
+
 def test_a_picture_of_a_failed_start_is_never_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cv2.imwrite(str(tmp_path / "blank.png"), np.full((240, 320, 3), 120, dtype=np.uint8))
     kept = tmp_path / "t-refused.png"
@@ -263,6 +286,19 @@ def test_jitter_is_the_noise_without_the_motion() -> None:
         shake = rng.normal(0, 1.0, 2)  # motion of the camera
         moved = 0.05 * number * np.sin(rest / 100) + shake + rng.normal(0, 0.03, rest.shape)
         tracked = TrackingResult(rest + moved, moved, yes, ~yes, yes.astype(float), 10, 13, 20.0)
+        summary.add(TrackedImage(number, SourceImage("", np.zeros((1, 1, 3), np.uint8), number / 25), tracked), 1e-3)
+    assert summary.jitter() == pytest.approx(0.03, rel=0.2)
+
+
+def test_jitter_of_a_short_recording_is_not_that_of_its_reference() -> None:
+    """The reference is the running mean of the first eight images, with which the displacements are too small."""
+    rng = np.random.default_rng(0)
+    rest = np.stack(np.meshgrid(np.arange(13), np.arange(10)), axis=-1).reshape(-1, 2) * 20.0
+    summary, yes = TrackingSummary(), np.ones(130, dtype=bool)
+    positions = rest + rng.normal(0, 0.03, (12, 130, 2))
+    for number, position in enumerate(positions):
+        moved = position - positions[: min(number, 7) + 1].mean(0)
+        tracked = TrackingResult(position, moved, yes, ~yes, yes.astype(float), 10, 13, 20.0)
         summary.add(TrackedImage(number, SourceImage("", np.zeros((1, 1, 3), np.uint8), number / 25), tracked), 1e-3)
     assert summary.jitter() == pytest.approx(0.03, rel=0.2)
 

@@ -2,6 +2,7 @@
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -68,6 +69,24 @@ def test_forces_are_written_everywhere(
     assert [value["contact"] for value in recorded] == [False, False, True, True, True, True]
     assert recorded[-1]["normal"] == pytest.approx(float(rows[-1]["normal_n"]), abs=1e-4)
     assert cv2.imread(str(files[2])) is not None
+
+
+def test_a_grid_that_is_rotated_in_the_image_has_the_same_forces(
+    images: Path, pressed: PressedGel, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    renderer = AccurateGelRenderer(replace(LOOK, width=880, height=760))
+    turn = cv2.getRotationMatrix2D((439.5, 379.5), -15.0, 1.0)  # clockwise
+    for number, share in enumerate((0.0, 0.5, 1.0)):
+        picture = renderer.render(share * pressed.displacement_mm, number=number).image
+        turned = cv2.warpAffine(picture, turn, (880, 760), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        cv2.imwrite(str(tmp_path / f"{number}.png"), turned)
+    scale = ["--pixels-per-mm", str(LOOK.pixels_per_mm), "--gel", str(images / "gel.toml")]
+    assert main(["track", str(tmp_path), *scale, "--json"]) == 0
+    force = json.loads(capsys.readouterr().out)["force"]
+    assert force["normal"] == pytest.approx(pressed.normal, rel=0.1)
+    assert abs(force["moment"]) < 8e-5  # [N m]; in the axes of the image it would be 1.8e-4
+    np.testing.assert_allclose(force["shear"], turn[:, :2] @ pressed.shear[::-1], atol=0.03)
+    np.testing.assert_allclose(force["centre_mm"], turn[:, :2] @ pressed.centre_mm[::-1], atol=0.3)
 
 
 @pytest.fixture(scope="module")

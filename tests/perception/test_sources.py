@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from gelflow.errors import PeerError, PeerTimeout, UsageError
+from gelflow.perception.errors import TrackerInitError
 from gelflow.perception.sensors.profile import load_sensor_profile
-from gelflow.perception.sources import ImageSource, SourceImage, image_source
+from gelflow.perception.sources import ImageSource, SourceImage, image_source, start_on_image
 
 
 def picture(number: int, size: tuple[int, int] = (96, 64)) -> np.ndarray:
@@ -63,6 +64,65 @@ def test_a_folder_with_the_number_of_a_camera_is_ambiguous(tmp_path: Path, monke
         image_source("7")
     assert image_source("./7").kind == "folder"
     assert image_source("07").kind == image_source("6").kind == "camera"
+
+
+@pytest.mark.parametrize(("text", "number"), [("uvc:0", "0"), ("uvc:12", "12"), ("uvc:/dev/video2", "2")])
+def test_cameras_have_the_names_of_a_lab_file_too(text: str, number: str) -> None:
+    source = image_source(text)
+    assert (source.kind, source.text) == ("camera", number)
+
+
+@pytest.mark.parametrize("text", ["uvc:", "uvc:left", "uvc:/dev/v4l/by-id/left", "uvc://0"])
+def test_other_names_of_uvc_cameras_are_errors(text: str) -> None:
+    with pytest.raises(UsageError, match=f"expected a folder, a file, a URL or a camera number; {text} does not exist"):
+        image_source(text)
+
+
+def test_a_tiff_file_with_several_pages_is_an_error(tmp_path: Path) -> None:
+    cv2.imwritemulti(str(tmp_path / "1.tiff"), [picture(number) for number in range(3)])
+    cv2.imwrite(str(tmp_path / "0.tif"), picture(0))
+    for source, read in ((tmp_path / "1.tiff", 0), (tmp_path, 1)):
+        images = iter(image_source(str(source)))
+        assert [next(images).name for _ in range(read)] == ["0.tif"][:read]
+        with pytest.raises(UsageError, match=r"1\.tiff has 3 pages; split it into a folder of images"):
+            next(images)
+
+
+def start(image: np.ndarray) -> int:
+    """A start that fails on dark images."""
+    if image.max() < 50:
+        raise TrackerInitError(f"brightness {image.max()}", image)
+    return int(image.max())
+
+
+def images_of(levels: list[int], interval: float) -> Iterator[SourceImage]:
+    """Images of these brightnesses, and then the end of the stream."""
+    for number, level in enumerate(levels):
+        yield SourceImage(f"{number:06d}", np.full((4, 4, 3), level, dtype=np.uint8), number * interval)
+    raise PeerTimeout("the stream ended")
+
+
+def test_a_tracker_starts_on_a_later_image_of_a_live_source() -> None:
+    source, images = ImageSource("0", "camera"), images_of([0, 5, 200, 0], 0.1)
+    first, result = start_on_image(source, images, start)
+    assert first.name == "000002" and result == 200
+    assert source.skipped.unreadable == 2 and source.skipped.first == "image 000000: brightness 0"
+    assert next(images).name == "000003"
+
+
+@pytest.mark.parametrize(
+    ("kind", "levels", "skipped", "reason"),
+    [
+        ("camera", [0, 1, 2, 3, 200], 3, "brightness 3"),  # 2.1 s after the first
+        ("camera", [0, 1], 2, "brightness 1"),
+        ("folder", [0, 200], 0, "brightness 0"),
+    ],
+)
+def test_the_last_reason_against_a_start_is_reported(kind: str, levels: list[int], skipped: int, reason: str) -> None:
+    source = ImageSource("0", kind)
+    with pytest.raises(TrackerInitError, match=reason):
+        start_on_image(source, images_of(levels, 0.7), start)
+    assert source.skipped.unreadable == skipped
 
 
 def test_a_folder_without_a_readable_image_is_an_error(tmp_path: Path) -> None:

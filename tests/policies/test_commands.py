@@ -1,4 +1,4 @@
-"""The commands `gelflow train` and `gelflow eval`, and the shipped policy in simulation."""
+"""The commands `gelflow train` and `gelflow eval`, and the included policy in simulation."""
 
 import io
 import json

@@ -255,6 +255,17 @@ def test_a_damaged_state_is_rejected(tmp_path: Path) -> None:
         make_run(tmp_path).train()
 
 
+def test_the_first_update_of_a_fine_tuning_has_the_bounded_loss() -> None:
+    def first_update(bounded: float) -> dict[str, NDArray[Any]]:
+        settings = ImitationSettings(rollout=4, updates=5, batch=8, bounded=bounded, bounded_after=0.0)
+        learner = Imitation(ToyInsertion(4), SMALL, settings, seed=0, steps=1_000)
+        learner.update()
+        return learner.tensors()
+
+    bounded, unbounded = first_update(0.9), first_update(0.0)
+    assert any((bounded[name] != unbounded[name]).any() for name in bounded)
+
+
 def test_impossible_settings_are_rejected() -> None:
     for changes in ({"updates": 0}, {"memory": 0}, {"learning_rate": 0.0}):
         with pytest.raises(UsageError, match="above 0"):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,10 @@ class Direct(OraclePolicy):
         return np.asarray(np.clip(2 * observations[:, :2], -1, 1))
 
 
-def test_the_help_of_train_states_the_default_steps(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_help_of_train_states_the_default_steps(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "1000")  # no line breaks in names of recipes
     with pytest.raises(SystemExit):
         main(["train", "--help"])
     text = " ".join(capsys.readouterr().out.split())
@@ -42,6 +46,13 @@ def test_the_help_of_train_states_the_default_steps(capsys: pytest.CaptureFixtur
     assert all(f"{task} {count}" in text for task, count in steps.items())
     assert f"with --start {recipe_for('insertion', 'fine-tuning').steps}, " in text
     assert f"with --algorithm ppo {recipe_for('insertion', 'ppo').steps};" in text
+    for task in steps.keys() - {"insertion"}:
+        others: dict[int, list[str]] = {}
+        for name in recipe_names(task):
+            if (count := recipe_for(task, name).steps) != steps[task]:
+                others.setdefault(count, []).append(name)
+        listed = "".join(f", with --recipe {' or '.join(names)} {count}" for count, names in others.items())
+        assert re.search(re.escape(f"{task} {steps[task]}{listed}") + "[;)]", text)
 
 
 @pytest.mark.parametrize("task", task_names())
@@ -171,7 +182,8 @@ def test_a_report_has_tables_and_videos(tmp_path: Path) -> None:
     names = {path.name for path in report.files}
     assert {"results.json", "episodes.csv", "failures.csv", "failures.png", "failure.gif", "failure.png"} <= names
     assert all(path.stat().st_size > 0 for path in report.files)
-    assert json.loads((tmp_path / "results.json").read_text())["results"][0]["name"] == "policy"
+    results = json.loads((tmp_path / "results.json").read_text())
+    assert results["format"] == 1 and results["results"][0]["name"] == "policy"
     assert (tmp_path / "episodes.csv").read_text().splitlines()[0].endswith("steps,return,target_x [m],target_y [m]")
     (tmp_path / "file").touch()
     with pytest.raises(UsageError, match="cannot write into"):

@@ -56,6 +56,18 @@ def test_damaged_results_are_refused(tmp_path: Path, results: str) -> None:
         SavedEvaluation(tmp_path).evaluate()
 
 
+def test_results_of_a_newer_format_are_refused_and_those_without_a_number_are_read(tmp_path: Path) -> None:
+    row = {"name": "policy", "episodes": 4, "success": 0.5, "success_95": [0.1, 0.9], "reward": 1.0}
+    values = {"results": [row], "failures": []}
+    (tmp_path / "episodes.csv").write_text("")
+    (tmp_path / "results.json").write_text(json.dumps(values))
+    shown = SavedEvaluation(tmp_path).evaluate()
+    assert shown is not None and "policy of 4 episodes" in shown.text
+    (tmp_path / "results.json").write_text(json.dumps({"format": 2, **values}))
+    with pytest.raises(UsageError, match=r"results\.json has format 2; this gelflow reads format 1: update gelflow$"):
+        SavedEvaluation(tmp_path).evaluate()
+
+
 @needs_browser
 def test_page_shows_the_evaluation(folder: Path) -> None:
     check_page(SavedEvaluation(folder), texts=("some report", "oracle of 8 episodes"), film="success")

@@ -136,6 +136,35 @@ def test_damage_in_the_index_costs_no_other_records(tmp_path: Path, wrong: str) 
     assert recover(path, tmp_path / "saved.mcap").messages == 41
 
 
+@pytest.mark.parametrize("fill", [b"\0", b"\xff"])
+def test_damage_of_record_headers_costs_only_the_records_up_to_the_next_chunk(tmp_path: Path, fill: bytes) -> None:
+    """From the end of a chunk, over its message index, to the header of the following chunk."""
+    path = make(tmp_path / "session.mcap")
+    with SessionReader(path) as reader:
+        assert reader.summary is not None
+        first, second, third = reader.summary.chunk_indexes[1:4]
+        lost = sum(len(reader.chunk(chunk)) for chunk in (first, second))
+    data = bytearray(path.read_bytes())
+    begin, end = first.chunk_start_offset + first.chunk_length, second.chunk_start_offset + 9
+    data[begin - 200 : end] = fill * (end - begin + 200)
+    path.write_bytes(data)
+    report = recover(path, tmp_path / "saved.mcap")
+    assert (report.messages, report.damaged_chunks) == (41 - lost, 1)
+    assert report.lost_bytes == third.chunk_start_offset - begin
+
+
+def test_zeros_at_the_end_of_an_unfinished_file_are_lost_bytes(tmp_path: Path) -> None:
+    """As a power cut leaves them."""
+    path = make(tmp_path / "session.mcap")
+    with SessionReader(path) as reader:
+        assert reader.summary is not None
+        chunks = reader.summary.chunk_indexes
+        kept = sum(len(reader.chunk(chunk)) for chunk in chunks[:3])
+    path.write_bytes(path.read_bytes()[: chunks[3].chunk_start_offset] + bytes(5000))
+    report = recover(path, tmp_path / "saved.mcap")
+    assert (report.messages, report.lost_bytes) == (kept, 5000)
+
+
 def test_a_reader_goes_on_past_damaged_chunks_and_counts_them(tmp_path: Path) -> None:
     path = make(tmp_path / "session.mcap")
     data = bytearray(path.read_bytes())

@@ -1,4 +1,4 @@
-"""Intervals from planned attempts, compared with those from insertions of the shipped policy in the same worlds."""
+"""Intervals from planned attempts, compared with those from insertions of the included policy in the same worlds."""
 
 import dataclasses
 from collections.abc import Callable, Sequence

@@ -1,4 +1,4 @@
-"""The transfer matrix: worlds that differ from training in one thing, with the shipped policy, then fine-tuned.
+"""The transfer matrix: worlds that differ from training in one thing, with the included policy, then fine-tuned.
 
 Worlds are simulated, so that hundreds of insertions take seconds; policy and calibration do not use their values.
 """
@@ -102,9 +102,9 @@ def measure_world(
     attempts: int | None = None,
     processes: int = 1,
 ) -> dict[str, Any]:
-    """One row: success of the shipped policy, and after calibration and fine-tuning where it is lower than `below`.
+    """One row: success of the included policy, and after calibration and fine-tuning where it is lower than `below`.
 
-    The calibration uses five insertions of the shipped policy; the fine-tuning, in `folder`, draws from the
+    The calibration uses five insertions of the included policy; the fine-tuning, in `folder`, draws from the
     randomization that it has narrowed. Both know the true part and hole, as from a part file. `attempts` is the length
     of the fine-tuning, by default that of the recipe.
     """

@@ -57,7 +57,7 @@ class RecordedWorld:
 
 
 def record_world(seed: int, *, task: InsertionTask = INSERTION, plan: Sequence[PlannedMotion] = ()) -> RecordedWorld:
-    """Insertions with the shipped policy in the world of a seed, which differs from training in all quantities.
+    """Insertions with the included policy in the world of a seed, which differs from training in all quantities.
 
     With a `plan` its motions are made on the first part instead. Raises UsageError when the world cannot hold its part,
     or no attempt has contact.
@@ -77,7 +77,7 @@ def record_insertions(
     plan: Sequence[PlannedMotion] = (),
     **scene: Any,
 ) -> RecordedWorld:
-    """Insertions with the shipped policy in a world; the first `attempts` of each are recorded.
+    """Insertions with the included policy in a world; the first `attempts` of each are recorded.
 
     Parameters
     ----------
@@ -135,7 +135,7 @@ def _planned(
 def _with_policy(
     world: InsertionAttempts, misalignment: Array, attempts: int, rng: np.random.Generator
 ) -> tuple[list[_Row], dict[int, Array]]:
-    """Insertions with the shipped policy: the first `attempts` of each, and the planar poses of inserted parts."""
+    """Insertions with the included policy: the first `attempts` of each, and the planar poses of inserted parts."""
     task, insertions = world.task, world.num_envs
     shipped = load_network(default_checkpoint(), task=INSERTION)
     assert isinstance(shipped, FlowMapNetwork)

@@ -20,7 +20,7 @@ class Engine(ABC):
     def ended(self) -> list[tuple[Run, RunRecord]]:
         """The runs that ended since the last call, possibly none; waits for a short time.
 
-        A run whose worker was lost has a record with state "failed" and without exit code.
+        A run whose worker was lost or could not start it has a record with state "failed" and without exit code.
         """
 
     @abstractmethod

@@ -2,6 +2,7 @@
 
 import importlib
 import platform
+import shlex
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -10,7 +11,7 @@ from typing import Any
 
 from gelflow.errors import UsageError
 from gelflow.policies.sweep.engines.engine import Engine, lost
-from gelflow.policies.sweep.run import Run, RunRecord
+from gelflow.policies.sweep.run import Run, RunRecord, check_arguments
 from gelflow.policies.sweep.run_process import execute
 from gelflow.toml_tables import TomlTable
 
@@ -93,7 +94,7 @@ class SlurmEngine(Engine):
             jobs = [self._executor.submit(_Job(run)) for run in new]
         for run, job in zip(new, jobs, strict=True):
             self._jobs[run.name] = run, job
-            self._id_file(run).write_text(job.job_id, encoding="utf-8")
+            self._id_file(run).write_text(f"{job.job_id}\n{shlex.join(run.arguments)}", encoding="utf-8")
 
     def ended(self) -> list[tuple[Run, RunRecord]]:
         found = []
@@ -110,17 +111,23 @@ class SlurmEngine(Engine):
         self._jobs.clear()
 
     def _id_file(self, run: Run) -> Path:
+        """File with the id of the job in its first line, then the arguments of the run."""
         return self._folder / f"{run.name}.id"
 
     def _attach(self, run: Run) -> bool:
-        """Whether a job of an earlier sweep still executes the run, or waits in the queue."""
+        """Whether a job of an earlier sweep still executes the run, or waits in the queue.
+
+        Raises UsageError when this job has other options.
+        """
         try:
-            job_id = self._id_file(run).read_text(encoding="utf-8")
+            job_id, _, arguments = self._id_file(run).read_text(encoding="utf-8").partition("\n")
         except FileNotFoundError:
             return False
         job = self._job_class(self._folder, job_id)
         if job.done(force_check=True) or job.state == "UNKNOWN":  # unknown: SLURM has forgotten it
             return False
+        if arguments:  # earlier versions wrote the id only
+            check_arguments(run, tuple(shlex.split(arguments)))
         self._jobs[run.name] = run, job
         return True
 

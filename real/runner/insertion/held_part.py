@@ -227,7 +227,7 @@ class HeldPart:
         """
         supervisor = self._motion.supervisor
         supervisor.phases.enter(Phase.RETREAT)
-        x, y, yaw, _ = supervisor.hole_coordinates(self._motion.pose())
+        x, y, yaw, _ = supervisor.hole_coordinates(supervisor.within_workspace(self._motion.pose()))
         contact = self._guard.move(
             self._pose((x, y, yaw), height),
             threshold=self.thresholds.stuck,

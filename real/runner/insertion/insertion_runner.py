@@ -102,10 +102,10 @@ class InsertionRunner:
         except NotGrasped as error:
             outcome = str(error)
             self._motion.wait(_STATE_TIME)
-            if holds_part(self._cell.gripper.state(), grasped=True):  # too wide, for example: it blocked the fingers
+            if may_hold_part(self._cell.gripper.state(), grasped=True):  # too wide, for example: it blocked the fingers
                 self._release_to_operator(number)
             else:
-                self._retreat_without_part(number)
+                self._retreat_empty()
         except PartSlipped as error:  # at the hand-over, before the first attempt
             outcome = str(error)
             self._release_to_operator(number)
@@ -135,17 +135,19 @@ class InsertionRunner:
     def _end_lost(self, number: int, part: HeldPart | None, evidence: str) -> str:
         """End an insertion whose part was lost, or moved in the grip; returns the outcome.
 
-        A part that the gripper still reports is raised while both pads are observed, then handed back; `part` is None
-        at the hand-over. Raises PartLost when it moves again.
+        A part that may still be between the fingers is raised while both pads are observed, then handed back; `part` is
+        None at the hand-over. Raises PartLost when it moves again.
         """
-        if not holds_part(self._cell.gripper.state(), grasped=True):
-            self._retreat_without_part(number)
-            return "part lost"
-        self._motion.expect_part(True)  # with its present width
+        state = self._cell.gripper.state()
+        outcome = evidence if holds_part(state, grasped=True) else "part lost"
+        if not may_hold_part(state, grasped=True):
+            self._retreat_empty()
+            return outcome
+        self._motion.expect_part(True)  # as the gripper reports it now
         if part is not None:
             part.retreat(self._lab.part.load_height)
         self._release_to_operator(number)
-        return evidence
+        return outcome
 
     def check_plan(self, supervisor: Supervisor, before: Pose) -> list[str]:
         """Check the first targets of a run from the pose `before`; returns them as text. Nothing moves."""
@@ -179,6 +181,7 @@ class InsertionRunner:
         self._rise()
         self._motion.move(self.pose((0.0, 0.0, 0.0), lab.part.load_height))
         if abs(self._cell.gripper.state().width - lab.gripper.open_width) > 1e-3:
+            self._motion.wait(0.0)
             self._cell.gripper.move(width=lab.gripper.open_width, speed=lab.gripper.speed)
         self._operator.present(number)
         self._motion.wait(0.0)
@@ -187,6 +190,7 @@ class InsertionRunner:
         if self._forces is not None:
             self._forces.set_rest(observer.resting_pads)  # the fingers are open
         latency = self._cell.latency
+        self._motion.wait(0.0)  # the fingers do not close after a stop
         with latency.grasp(self._clock):
             try:
                 self._cell.gripper.grasp(
@@ -345,6 +349,7 @@ class InsertionRunner:
         phases = self._motion.supervisor.phases
         if phases.phase is Phase.LOAD:  # at the height of the hand-over already
             phases.enter(Phase.RETREAT)
+        self._motion.expect_part(False)  # the arm is at rest, and the operator may move the part
         self._operator.take(number)
         phases.enter(Phase.RELEASE)
         self._open()
@@ -360,18 +365,13 @@ class InsertionRunner:
         self._motion.supervisor.phases.enter(Phase.RETREAT)
         self._rise()
 
-    def _retreat_without_part(self, number: int) -> None:
-        """Move up after the gripper reported that it holds no part; fingers that still press are opened as for one."""
-        self._retreat_empty()
-        if may_hold_part(self._cell.gripper.state(), grasped=False):
-            self._release_to_operator(number)
-
     def _rise(self) -> None:
         """Without a held part: straight up to the height of the hand-over, unless the gripper is higher.
 
         The fingers may be around a part in the hole.
         """
-        x, y, yaw, height = self._motion.supervisor.hole_coordinates(self._motion.pose())
+        supervisor = self._motion.supervisor
+        x, y, yaw, height = supervisor.hole_coordinates(supervisor.within_workspace(self._motion.pose()))
         if height < self._lab.part.load_height - _LEVEL:
             self._motion.move(self.pose((x, y, yaw), self._lab.part.load_height))
 

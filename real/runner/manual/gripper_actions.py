@@ -27,6 +27,8 @@ def home(session: Session) -> Result:
         question = f"The fingers move outwards to their end stop; {what}. Is nothing else between or beside them?"
         if not session.agreed(question, gripper.state):
             return {"done": False, "state": state}
+        if state.grasp == "holding":  # the device then accepts no other motion
+            gripper.release(width=session.lab.gripper.open_width, speed=session.lab.gripper.speed)
         gripper.home(part_removed=held)
         return {"done": True, "state": gripper.state()}
 

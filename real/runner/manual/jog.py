@@ -155,6 +155,7 @@ def _arm_pose(session: Session, devices: _Devices) -> Pose:
 def _steps(session: Session, supervisor: Supervisor, here: Pose, wanted: Jog) -> list[_Step]:
     """The motions of a jog, each checked relative to the one before. Raises SafetyError when one is refused."""
     load = session.lab.part.load_height
+    here = supervisor.within_workspace(here)
     height = supervisor.hole_coordinates(here)[3]
     poses: list[tuple[str, Pose]] = []
     if wanted.axis == "load":

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from gelflow.clock import ScaledClock
 from gelflow.errors import PeerTimeout
 from gelflow.geometry import Pose
-from gelflow.real.limits import LIMITS
 from gelflow.real.runner.lab import Lab
-from gelflow.real.runner.motion_executor import ARRIVED, MotionExecutor
+from gelflow.real.runner.motion_executor import ARRIVED, LONGEST_UNOBSERVED, MotionExecutor
 from gelflow.real.runner.phases import Phase
 from gelflow.real.runner.touch.observer import TactileObserver, TactileReading
 from gelflow.session.recorder import SessionRecorder
@@ -20,9 +19,6 @@ from gelflow.time_sync import RUNNER
 
 # From the reception of an image that shows contact to the arm at rest: tracking, hold, lag of the arm [s].
 _REACTION_TIME = 0.03
-# Age of the newest readable image at which the arm holds [s]: 250 ms, less the longest wait of the observer and
-# tracking.
-_UNREADABLE_TIME = LIMITS.image_age - 0.03
 _REST_TIME = 0.1  # from a hold until the arm and the newest images are at rest [s]
 _FREE_OVERSHOOT = 0.5e-3  # after contact in motions up, sideways and above the range in which the rim is searched [m]
 _DOWNWARD = 0.05e-3  # a target further below the arm than this is a motion towards contact [m]
@@ -122,10 +118,10 @@ class GuardedMotion:
         """
         zero = np.zeros((2, 2)) if baseline is None else baseline
         speed = self.speed_towards(target) if speed is None else speed
-        self._motion.go(target, speed=speed, guarded=True)
-        progress = self._motion.progress(target)
         # A mock robot's time waits for this loop: on a busy computer the arm would travel on before an image is seen.
         with self._clock.bounded(RUNNER) as renew:
+            self._motion.go(target, speed=speed, guarded=True)
+            progress = self._motion.progress(target)
             while not self._motion.arrived(within=within):
                 renew()
                 self._motion.wait(0.0)
@@ -136,9 +132,12 @@ class GuardedMotion:
                     if on_reading(reading) or change > threshold:
                         self._motion.hold()
                         return Contact(reading, change)
-                if self.observer.blind_time() >= _UNREADABLE_TIME:
+                if self.observer.blind_time() >= LONGEST_UNOBSERVED:
                     self._motion.hold()
                     self._wait_until_readable()
+                    self._motion.go(target, speed=speed, guarded=True)
+                    progress = self._motion.progress(target)
+                elif not self._motion.observed():  # this thread has stalled
                     self._motion.go(target, speed=speed, guarded=True)
                     progress = self._motion.progress(target)
                 progress.check()
@@ -161,7 +160,7 @@ class GuardedMotion:
         values = {"camera": self.observer.blind_camera, "seconds": self.observer.blind_time()}
         self._recorder.event("pad not readable", values)
         begun = self._clock.now() - self.observer.blind_time()
-        while self.observer.blind_time() >= _UNREADABLE_TIME:
+        while self.observer.blind_time() >= LONGEST_UNOBSERVED:
             if (seconds := self._clock.now() - begun) > self._lab.limits.stale_frame:
                 raise TouchLost(
                     f"camera {self.observer.blind_camera}: no readable image in time for {seconds:.2f} s with a part "

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from gelflow.errors import GelflowError
 from gelflow.gel.gel_file import ElasticGel
 from gelflow.helper_process import HelperProcess
-from gelflow.perception.force.image_forces import GridScale
+from gelflow.perception.force.image_forces import GridAxes, GridScale, record_in_image
 from gelflow.perception.frames import CameraMount
 from gelflow.perception.tracker import TrackingResult
 from gelflow.protocols import CameraImage
@@ -136,15 +136,17 @@ class PadForces:
             return {} if self._ended else waiting
 
     def _estimate(self, sensor: int, tracked: _Tracked, *, reset: bool) -> None:
-        request = _request(tracked, self._mounts[sensor])
+        axes = _axes(tracked, self._mounts[sensor])
+        request = _request(tracked, self._mounts[sensor], axes)
         self._helper.messages.send(request | {"sensor": sensor, "reset": reset})
         answers = self._helper.messages.wait()
         if not answers:
             raise ConnectionError(self._helper.exit_reason())
-        if answers[0] is not None:
-            self._recorder.force(sensor, tracked.image.stamp, answers[0])
+        record = None if answers[0] is None else record_in_image(answers[0], axes)
+        if record is not None:
+            self._recorder.force(sensor, tracked.image.stamp, record)
         with self._changed:
-            self._known.append((sensor, tracked.image.sequence, answers[0]))
+            self._known.append((sensor, tracked.image.sequence, record))
             self._changed.notify_all()
 
     def _end(self, reason: str) -> None:
@@ -177,10 +179,17 @@ def _scale(mount: CameraMount) -> GridScale:
     return GridScale(mount.pitch, mount.pixels_per_mm)
 
 
-def _request(tracked: _Tracked, mount: CameraMount) -> dict[str, Any]:
-    """A request: displacements (right, down) [mm] from the unloaded pad, shape (markers, 2), and validity."""
+def _axes(tracked: _Tracked, mount: CameraMount) -> GridAxes:
+    """The axes of the grid relative to those of the displacements, which a calibration aligns with the grid."""
+    if mount.calibration is not None:
+        return GridAxes()
+    return GridAxes.of(tracked.rest.position, *mount.image_grid)
+
+
+def _request(tracked: _Tracked, mount: CameraMount, axes: GridAxes) -> dict[str, Any]:
+    """A request: displacements from the unloaded pad along `axes` [mm], shape (markers, 2), and validity."""
     displacement = tracked.result.position - tracked.rest.position
-    moved = mount.displacement_mm(replace(tracked.result, displacement=displacement))
+    moved = axes.to_grid(mount.displacement_mm(replace(tracked.result, displacement=displacement)))
     valid = tracked.result.valid & tracked.rest.valid
     return {
         "stamp": tracked.image.stamp,

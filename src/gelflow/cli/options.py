@@ -12,6 +12,7 @@ from gelflow.part import CUBOID
 from gelflow.task import INSERTION, InsertionTask
 
 DEFAULT_RANDOMIZATION = "default"
+_PAGE_ADDRESS = {"port": 8080, "host": "127.0.0.1"}  # options of a page and their defaults
 
 
 def add_json(parser: argparse.ArgumentParser) -> None:
@@ -181,15 +182,26 @@ def check_at_least(args: argparse.Namespace, **limits: int) -> None:
 def add_page_address(parser: argparse.ArgumentParser, *, of: str = "") -> None:
     """`--port` and `--host`: the address of a page."""
     parser.add_argument(
-        "--port", type=int, default=8080, metavar="P", help=f"TCP port{of}; 0: a free one (default %(default)s)"
+        "--port",
+        type=int,
+        default=_PAGE_ADDRESS["port"],
+        metavar="P",
+        help=f"TCP port{of}; 0: a free one (default %(default)s)",
     )
     parser.add_argument(
         "--host",
-        default="127.0.0.1",
+        default=_PAGE_ADDRESS["host"],
         metavar="H",
         help=f"address to serve on{of}; other machines reach 0.0.0.0 and need the token in the printed address "
         "(default %(default)s)",
     )
+
+
+def check_page_address(args: argparse.Namespace, page: str) -> None:
+    """Raise UsageError when `--port` or `--host` is given without the option `page` that serves the page."""
+    for name, default in _PAGE_ADDRESS.items():
+        if getattr(args, name) != default and not getattr(args, page):
+            raise UsageError(f"--{name} is for the page of --{page}; add --{page}")
 
 
 def add_view(parser: argparse.ArgumentParser) -> None:

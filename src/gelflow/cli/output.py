@@ -20,8 +20,8 @@ class Output:
 
     def __init__(self, as_json: bool = False, *, width: int | None = None) -> None:
         self.json = as_json
-        # Without markup: square brackets are part of units and file names.
-        self.console = Console(highlight=False, markup=False, stderr=self.json, width=width)
+        # Without markup and emoji: square brackets are part of units and file names, and colons of addresses.
+        self.console = Console(highlight=False, markup=False, emoji=False, stderr=self.json, width=width)
 
     def text(self, line: str) -> None:
         """Print one line without line breaks."""
@@ -50,7 +50,7 @@ def progress_bar(*columns: ProgressColumn, count: bool = False, auto_refresh: bo
 
     `count` shows the number of finished items; `columns` are added before the remaining time.
     """
-    errors = Console(stderr=True, markup=False)
+    errors = Console(stderr=True, markup=False, emoji=False)
     counter = [MofNCompleteColumn()] if count else []
     shown = [TextColumn("{task.description}", markup=False), BarColumn(), *counter, *columns]
     return Progress(

@@ -3,6 +3,7 @@
 import contextlib
 import os
 import struct
+from bisect import bisect_right
 from collections.abc import Iterator
 from dataclasses import dataclass
 from io import BytesIO
@@ -14,6 +15,7 @@ from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
 from mcap.records import Channel, Chunk, McapRecord, Message, Metadata, Schema
 from mcap.stream_reader import breakup_chunk
+from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC, Writer
 
 from gelflow import __version__
@@ -21,6 +23,9 @@ from gelflow.errors import PeerError, UsageError
 from gelflow.session.messages import DECODE_ERRORS, READ_ERRORS
 from gelflow.session.reader import SessionReader, is_being_recorded, is_finished, open_recording
 from gelflow.session.recorder import CHUNK_BYTES
+
+_HEAD = struct.Struct("<BQ")  # opcode and length of a record
+_OPCODES = frozenset(map(int, Opcode))
 
 
 @dataclass(frozen=True)
@@ -30,7 +35,7 @@ class RecoveryReport:
     path: Path  # the new file
     messages: int  # number of recovered messages
     duration: float  # from the first to the last recovered message [s]
-    lost_bytes: int  # of an incomplete record at the end of the file
+    lost_bytes: int  # of incomplete records, and of damage outside the chunks
     damaged_chunks: int  # of complete length but with invalid contents; not copied
 
 
@@ -70,9 +75,9 @@ def _copied(stream: BinaryIO, source: Path, target: Path) -> "_Copy":
         ) from None
     try:
         with out:
-            copy = _Copy(out)
-            copy.take_summary(stream)
-            for opcode, data in _complete_records(stream, copy):
+            copy, summary = _Copy(out), _summary(stream)
+            copy.take_summary(summary)
+            for opcode, data in _complete_records(stream, _chunk_starts(stream, summary), copy):
                 copy.take(opcode, data)
             copy.finish(source)
         if copy.messages == 0:
@@ -107,13 +112,10 @@ class _Copy:
         self.messages = self.damaged = self.lost = 0
         self.first = self.last = 0
 
-    def take_summary(self, stream: BinaryIO) -> None:
+    def take_summary(self, summary: Summary) -> None:
         """Copy the schemas and channels at the end of a finished file: those in its first chunk may be damaged."""
-        if not is_finished(stream):
-            return
         with contextlib.suppress(*READ_ERRORS):
-            summary = SeekingReader(stream, validate_crcs=True).get_summary()
-            for record in [] if summary is None else [*summary.schemas.values(), *summary.channels.values()]:
+            for record in [*summary.schemas.values(), *summary.channels.values()]:
                 self._put(record)
 
     def take(self, opcode: int, data: bytes) -> None:
@@ -159,22 +161,44 @@ class _Copy:
         os.fsync(self._out.fileno())
 
 
-def _complete_records(stream: BinaryIO, copy: _Copy) -> Iterator[tuple[int, bytes]]:
-    """Top-level records (opcode, contents) up to the first incomplete one.
+def _summary(stream: BinaryIO) -> Summary:
+    """The index at the end of a finished file; empty where there is none that can be read."""
+    if is_finished(stream):
+        with contextlib.suppress(*READ_ERRORS):
+            return SeekingReader(stream, validate_crcs=True).get_summary() or Summary()
+    return Summary()
+
+
+def _chunk_starts(stream: BinaryIO, summary: Summary) -> list[int]:
+    """Positions of the chunks in the index of the file, in order; those that are not the start of a chunk excepted."""
+    starts = []
+    for index in summary.chunk_indexes:
+        with contextlib.suppress(*READ_ERRORS):
+            stream.seek(index.chunk_start_offset)
+            if _HEAD.unpack(stream.read(_HEAD.size)) == (Opcode.CHUNK, index.chunk_length - _HEAD.size):
+                starts.append(index.chunk_start_offset)
+    return sorted(starts)
+
+
+def _complete_records(stream: BinaryIO, starts: list[int], copy: _Copy) -> Iterator[tuple[int, bytes]]:
+    """Top-level records (opcode, contents). After damage they continue at the next of the chunk positions `starts`.
 
     Lengths are checked here because the library's reader takes a short read for a short record.
     """
     size = stream.seek(0, 2)
-    position = stream.seek(len(MCAP0_MAGIC))
-    while position + 9 <= size:
-        opcode, length = struct.unpack("<BQ", stream.read(9))
-        if length > size - position - 9:
-            break
+    position = len(MCAP0_MAGIC)
+    while position + _HEAD.size <= size:
+        stream.seek(position)
+        opcode, length = _HEAD.unpack(stream.read(_HEAD.size))
+        following = bisect_right(starts, position)
+        limit = starts[following] if following < len(starts) else size
+        end = position + _HEAD.size + length
+        if opcode not in _OPCODES or end > limit:
+            copy.lost += limit - position
+            position = limit
+            continue
         yield opcode, stream.read(length)
-        position += 9 + length
+        position = end
         if opcode == Opcode.FOOTER:
-            break
-    else:
-        copy.lost = size - position
-        return
-    copy.lost = 0 if opcode == Opcode.FOOTER else size - position
+            return
+    copy.lost += size - position

@@ -39,7 +39,7 @@ def _joint(joint: JointPart) -> str:
 
 
 def _pad(pad: PadPart) -> str:
-    grid = f"{pad.rows} × {pad.cols} grid, pitch {pad.pitch:g} mm" if pad.pitch else f"{pad.markers} markers"
+    grid = f"{pad.rows} × {pad.cols} grid, pitch {pad.pitch_mm:g} mm" if pad.pitch_mm else f"{pad.markers} markers"
     against = _plain(", ".join(pad.against))
     return f"{_plain(pad.name)}: {pad.shape}, {grid}, touches {against}, {pad.law} law"
 

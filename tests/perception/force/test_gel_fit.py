@@ -1,5 +1,6 @@
 """Calibration of a gel: modulus, lag, thickness, and wrong tables."""
 
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from gelflow.gel.creep import deformation
 from gelflow.gel.gel_file import ElasticGel
 from gelflow.observation import Grid
 from gelflow.perception.force.estimator import ForceEstimator
-from gelflow.perception.force.gel_fit import fit_gel, read_samples
+from gelflow.perception.force.gel_fit import ForceSamples, fit_gel, read_samples
 from gelflow.perception.output.forces import ForceTable
 from gelflow.perception.synthetic.pressed_layer import SHAPES, PressedLayer, random_press
 
@@ -78,6 +79,87 @@ def test_modulus_from_known_weights(layer: PressedLayer, tmp_path: Path) -> None
     fit = fit_gel(read_samples(estimates, tmp_path / "weights.csv"), GUESS)
     assert fit.contacts == 5 and fit.shear is None
     assert fit.gel.youngs_modulus == pytest.approx(TRUE.youngs_modulus, rel=0.08)
+
+
+def without_estimates(table: Path, numbers: Iterable[int]) -> None:
+    """Empty the cells of some images, as where too few markers are measured."""
+    head, *rows = (line.split(",") for line in table.read_text().splitlines())
+    for number in numbers:
+        rows[number][3:] = [""] * len(rows[number][3:])
+    table.write_text("\n".join(map(",".join, [head, *rows])))
+
+
+def test_images_of_one_contact_share_their_error(layer: PressedLayer, tmp_path: Path) -> None:
+    estimates, scale = record(layer, tmp_path)
+    forces = [line.split(",")[1] for line in scale.read_text().splitlines()[1:]]
+    scale.write_text("image,normal_n\n" + "\n".join(f"{k}.jpg,{force}" for k, force in enumerate(forces)))
+    fit = fit_gel(read_samples(estimates, scale), GUESS)
+    assert fit.contacts == 5
+    assert fit.gel.youngs_modulus_deviation > 0.026  # 6 % / sqrt(5)
+
+
+@pytest.mark.parametrize("by_image", [False, True])
+def test_an_image_without_an_estimate_does_not_end_a_contact(
+    layer: PressedLayer, tmp_path: Path, by_image: bool
+) -> None:
+    estimates, scale = record(layer, tmp_path)
+    if by_image:
+        scale.write_text("image,normal_n\n" + "\n".join(f"{k}.jpg,2" for k in range(115)))
+    without_estimates(estimates, [8, 31])
+    samples = read_samples(estimates, scale)
+    assert len(np.unique(samples.contact)) == 5 and samples.started.all()
+
+
+def test_a_contact_starts_where_the_image_before_was_measured_without_one(layer: PressedLayer, tmp_path: Path) -> None:
+    """The first contact is measured from its middle on; the second has no estimates at its start."""
+    estimates, scale = record(layer, tmp_path)
+    head, *rows = scale.read_text().splitlines()
+    scale.write_text("\n".join([head, *rows[8:]]))
+    without_estimates(estimates, range(20, 31))
+    samples = read_samples(estimates, scale)
+    started = [samples.started[samples.contact == number].tolist() for number in range(5)]
+    assert [any(of_contact) for of_contact in started] == [False, False, True, True, True]
+    assert [all(of_contact) for of_contact in started] == [False, False, True, True, True]
+
+
+def test_contacts_whose_start_was_not_seen_do_not_change_the_lag() -> None:
+    """Their force is constant, and the gel has followed it before the first image."""
+    stamps = np.arange(50) / RATE
+    forces = [np.minimum(1.0, (stamps + 0.02) / 0.06) * force for force in (1.0, 2.0, 3.0)]
+    lagging = [deformation(np.append(0.0, force), np.append(-0.02, stamps), 0.25, 0.1)[1:] for force in forces]
+    constant = [np.full(50, 4.0), np.full(50, 5.0)]
+    normal = np.concatenate(lagging + constant) / 1.4
+    samples = ForceSamples(
+        stamp=np.concatenate([stamps + 10 * number for number in range(5)]),
+        contact=np.repeat(np.arange(5), 50),
+        started=np.repeat([True, True, True, False, False], 50),
+        normal=normal,
+        shear=0.2 * normal,
+        measured_normal=np.concatenate(forces + constant),
+        measured_shear=np.full(250, np.nan),
+        in_time=True,
+    )
+    fit = fit_gel(samples, GUESS)
+    assert fit.gel.creep == pytest.approx(0.25, abs=0.01)
+    assert fit.gel.creep_time == pytest.approx(0.1, rel=0.05)
+    assert fit.gel.youngs_modulus == pytest.approx(1.4 * GUESS.youngs_modulus, rel=1e-3)
+
+
+def test_times_in_milliseconds_are_refused(layer: PressedLayer, tmp_path: Path) -> None:
+    estimates, scale = record(layer, tmp_path)
+    head, *rows = (line.split(",") for line in scale.read_text().splitlines())
+    in_milliseconds = [[f"{1e3 * float(stamp)}", *forces] for stamp, *forces in rows]
+    scale.write_text("\n".join(map(",".join, [head, *in_milliseconds])))
+    with pytest.raises(UsageError, match=r"of 115 rows .* stamp must be in seconds"):
+        read_samples(estimates, scale)
+
+
+def test_a_table_may_be_longer_than_the_images(layer: PressedLayer, tmp_path: Path) -> None:
+    """Two rows a second for 200 s; the images take 2.3 s."""
+    estimates, scale = record(layer, tmp_path)
+    images = len(read_samples(estimates, scale).stamp)
+    scale.write_text("stamp,normal_n\n" + "\n".join(f"{0.5 * k},2" for k in range(-200, 200)))
+    assert len(read_samples(estimates, scale).stamp) == images
 
 
 def test_a_wrong_thickness_shows(layer: PressedLayer, tmp_path: Path) -> None:

@@ -120,6 +120,18 @@ def test_sessions_of_different_set_ups_are_not_calibrated_together(tmp_path: Pat
             read_recordings([usual, other])
 
 
+def test_a_record_of_an_attempt_without_its_values_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """As a program of one's own may record it."""
+    path = tmp_path / "own.mcap"
+    with SessionRecorder(path, ScaledClock()) as recorder:
+        recorder.metadata(describe_session(task=INSERTION, trackers=[{}, {}], mounts=[{}, {}], lab=LAB))
+        recorder.attempt_end({"insertion": 0, "attempt": 0, "outcome": "inserted"})
+    with pytest.raises(UsageError, match=r"own\.mcap: a record of /attempt has no planar_pose, depth, contact"):
+        read_recordings([path])
+    assert main(["calibrate", str(path), "--out", str(tmp_path / "out")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
 def test_a_session_is_not_calibrated_together_with_its_copy(tmp_path: Path, world: RecordedWorld) -> None:
     path = write_session(tmp_path / "a.mcap", world)
     copy = Path(shutil.copy(path, tmp_path / "copy.mcap"))

@@ -15,9 +15,10 @@ from tests.common.processes import is_running
 from tests.policies.sweep.fake_training import STEPS
 
 from gelflow.errors import UsageError
-from gelflow.policies.sweep.engines.engine import Engine
+from gelflow.policies.sweep.engines.engine import Engine, lost
 from gelflow.policies.sweep.grid import CommandOptions, read_grid
 from gelflow.policies.sweep.run import Run, RunRecord, read_record
+from gelflow.policies.sweep.run_process import execute
 from gelflow.policies.sweep.sweep import execute_runs, incomplete, sweep_folder
 
 PROGRAM = (str(Path(__file__).with_name("fake_training.py")),)
@@ -54,9 +55,28 @@ def sweep(runs: Sequence[Run], engine: Callable[[], Engine], *, tries: int = 3) 
         ended.append((run.name, record.state, again))
 
     folder = runs[0].folder
-    with sweep_folder(folder, folder.parent / "grid.toml"), engine() as made:
+    with sweep_folder(folder), engine() as made:
         execute_runs(incomplete(runs), made, tries=tries, report=report)
     return ended
+
+
+class Worker(Engine):
+    """Executes runs one after the other, as a worker of Ray or SLURM on the machine `node7`."""
+
+    def __init__(self, *, loses_results: bool = False) -> None:
+        self._runs: list[Run] = []
+        self._loses_results = loses_results
+
+    def submit(self, runs: Sequence[Run]) -> None:
+        self._runs.extend(runs)
+
+    def ended(self) -> list[tuple[Run, RunRecord]]:
+        run = self._runs.pop(0)
+        record = execute(run, "node7")
+        return [(run, lost(run, "no connection") if self._loses_results else record)]
+
+    def close(self) -> None:
+        self._runs.clear()
 
 
 def steps(run: Run) -> list[tuple[int, int]]:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -12,6 +13,7 @@ from tests.common.processes import is_running
 from tests.policies.sweep.harness import (
     LINUX,
     TWO_SEEDS,
+    Worker,
     assert_resumed,
     held,
     is_held,
@@ -75,17 +77,18 @@ def test_a_failing_run_is_tried_a_few_times_and_others_go_on(tmp_path: Path) -> 
     assert sweep(runs, two) == [(runs[1].name, "complete", False)]
 
 
-def test_wrong_input_is_not_tried_again(tmp_path: Path) -> None:
-    runs = make_runs(tmp_path)[:1]
-    runs[0].folder.mkdir()
-    (runs[0].folder / "refuse").touch()
-    assert sweep(runs, two) == [(runs[0].name, "failed", False)]
-    assert read_record(runs[0]).error == "exit code 2: asked to refuse"
+def test_exit_code_2_is_tried_again(tmp_path: Path) -> None:
+    """It is that of a full disk too, not only of wrong input."""
+    (run,) = make_runs(tmp_path)[:1]
+    run.folder.mkdir()
+    (run.folder / "refuse").touch()
+    assert sweep([run], two, tries=2) == [(run.name, "failed", True), (run.name, "failed", False)]
+    assert read_record(run).error == "exit code 2: asked to refuse"
 
 
 def test_at_most_one_process_executes_a_run(tmp_path: Path) -> None:
     (run,) = make_runs(tmp_path)[:1]
-    with sweep_folder(run.folder, tmp_path / "grid.toml"):
+    with sweep_folder(run.folder):
         (run.folder / "hold").touch()
         with RunProcess(run) as first, RunProcess(run) as second:
             assert first.poll() is None
@@ -107,20 +110,45 @@ def test_the_result_of_a_run_that_ended_after_its_worker_was_lost_is_kept(tmp_pa
     assert read_record(run) == complete
 
 
+def test_a_complete_run_whose_result_does_not_arrive_is_complete(tmp_path: Path) -> None:
+    (run,) = make_runs(tmp_path)[:1]
+    assert sweep([run], lambda: Worker(loses_results=True)) == [(run.name, "complete", False)]
+    record = read_record(run)
+    assert (record.state, record.exit_code, record.error, record.starts) == ("complete", 0, "", 1)
+    assert record.result["validation"] == {"success": 18.0}
+
+
+def test_a_run_without_its_record_and_folder_is_started_again(tmp_path: Path) -> None:
+    """Its former output, which remains, is not taken as its result."""
+    (run,) = make_runs(tmp_path)[:1]
+    sweep([run], two)
+    run.record.unlink()
+    shutil.rmtree(run.folder / "runs" / run.name)
+    assert sweep([run], two) == [(run.name, "complete", False)]
+    assert read_record(run).starts == 1 and run.log.read_text().count("=== start ") == 2
+
+
 def test_a_machine_without_the_folder_reports_it(tmp_path: Path) -> None:
     (run,) = make_runs(tmp_path)[:1]
     record = execute(run, "node7")
-    assert record.state == "failed" and not record.start_again
+    assert record.state == "failed"
     assert "node7 has no folder" in record.error and "all machines of a sweep must share it" in record.error
+
+
+def test_the_reason_why_a_machine_could_not_start_a_run_is_stored(tmp_path: Path) -> None:
+    run = dataclasses.replace(make_runs(tmp_path)[0], working_folder=tmp_path / "elsewhere")
+    assert sweep([run], Worker, tries=2) == [(run.name, "failed", True), (run.name, "failed", False)]
+    record = read_record(run)
+    assert record.state == "failed" and record.starts == 0
+    assert "node7 has no folder" in record.error
 
 
 def test_two_sweeps_cannot_use_one_folder(tmp_path: Path) -> None:
     run = make_runs(tmp_path)[0]
-    grid = tmp_path / "grid.toml"
     with (
-        sweep_folder(run.folder, grid),
+        sweep_folder(run.folder),
         pytest.raises(UsageError, match=f"another sweep uses .* process {os.getpid()}"),
-        sweep_folder(run.folder, grid),
+        sweep_folder(run.folder),
     ):
         pass
 

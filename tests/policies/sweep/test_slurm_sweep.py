@@ -5,7 +5,7 @@ import signal
 from pathlib import Path
 
 import pytest
-from tests.policies.sweep.harness import LINUX, assert_resumed, held, kill, make_runs, signal_worker, sweep
+from tests.policies.sweep.harness import LINUX, TWO_SEEDS, assert_resumed, held, kill, make_runs, signal_worker, sweep
 
 from gelflow.errors import UsageError
 from gelflow.policies.sweep.engines.slurm import SlurmEngine, SlurmSettings
@@ -54,6 +54,33 @@ def test_a_run_continues_after_the_time_limit_of_its_job(tmp_path: Path) -> None
         ended = sweep(runs, lambda: local(runs))
     assert ended == [(runs[0].name, "complete", False)]
     assert_resumed(runs[0])
+
+
+def test_a_pending_job_is_not_submitted_twice_and_its_options_are_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The commands of SLURM are scripts: each job stays in the queue."""
+    scripts, submitted = tmp_path / "bin", tmp_path / "submitted"
+    scripts.mkdir()
+    for name, text in (
+        ("srun", ""),
+        ("sbatch", f"echo job >> '{submitted}'\necho Submitted batch job 7\n"),
+        ("sacct", "echo 'JobID|State|NodeList'\necho '7|PENDING|None assigned'\n"),
+    ):
+        (scripts / name).write_text(f"#!/bin/sh\n{text}")
+        (scripts / name).chmod(0o755)
+    monkeypatch.setenv("PATH", os.pathsep.join([str(scripts), os.environ["PATH"]]))
+
+    def submit(run: Run) -> None:
+        with SlurmEngine(run.folder, SlurmSettings(), cpus=1) as engine:
+            engine.submit([run])
+
+    run = make_runs(tmp_path)[0]
+    submit(run)
+    submit(run)
+    with pytest.raises(UsageError, match=r"with other options: 2\.0, now 3\.0; choose another --out"):
+        submit(make_runs(tmp_path, TWO_SEEDS.replace("2.0", "3.0"))[0])
+    assert submitted.read_text() == "job\n"
 
 
 def test_settings_become_options_of_sbatch() -> None:

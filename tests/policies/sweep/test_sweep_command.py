@@ -5,8 +5,11 @@ from pathlib import Path
 
 import pytest
 
+from gelflow.cli.commands.training.sweep import train_options
 from gelflow.cli.main import main
 from gelflow.policies.checkpoint import load_checkpoint
+from gelflow.policies.sweep.grid import read_grid
+from gelflow.policies.sweep.run import RunRecord, write_record
 
 GRID = 'task = "insertion"\nseeds = [0, 1]\n[options]\nattempts = 16\nenvs = 4\n'
 
@@ -38,9 +41,22 @@ def test_a_sweep_of_real_trainings_collects_and_resumes(tmp_path: Path, capsys: 
 def test_a_failed_run_gives_exit_code_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     grid = tmp_path / "wrong.toml"
     grid.write_text('task = "insertion"\n[options]\npreset = "fas"\n')
-    assert main(["sweep", str(grid), "--out", str(tmp_path / "sweep")]) == 1
+    assert main(["sweep", str(grid), "--out", str(tmp_path / "sweep"), "--tries", "1"]) == 1
     text = capsys.readouterr().out
     assert "failed: seed=0: exit code 2: gelflow train: " in text and "no preset 'fas'" in text
+
+
+def test_a_refused_sweep_keeps_the_stored_grid_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    grid, out = tmp_path / "grid.toml", tmp_path / "sweep"
+    grid.write_text(GRID)
+    for run in read_grid(grid, train_options()).runs(out):
+        run.record.parent.mkdir(parents=True, exist_ok=True)
+        write_record(run, RunRecord(run.name, run.arguments, "complete"))
+    (out / "grid.toml").write_text(GRID)
+    grid.write_text(GRID.replace("16", "32"))
+    assert main(["sweep", str(grid), "--out", str(out)]) == 2
+    assert "with other options: 16, now 32; choose another --out" in capsys.readouterr().err
+    assert (out / "grid.toml").read_text() == GRID
 
 
 @pytest.mark.parametrize(

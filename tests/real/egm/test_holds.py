@@ -92,13 +92,14 @@ def test_stop_without_feedback_latches_when_it_is_stale() -> None:
     assert robot.generator.latched == "the end"
 
 
-@pytest.mark.parametrize("turn_deg", [0.0, 15.0])
-def test_joint_speeds_stay_within_max_speed_deviation(turn_deg: float) -> None:
-    """20 mm/s and 10°/s are allowed, and the controller follows at 1°/s per joint."""
-    robot = Robot(dataclasses.replace(CONFIG, joint_speed=MAX_SPEED_DEVIATION))
+@pytest.mark.parametrize(("turn_deg", "turn_speed_deg"), [(0.0, 10.0), (15.0, 10.0), (15.0, 45.0)])
+def test_joint_speeds_stay_within_max_speed_deviation(turn_deg: float, turn_speed_deg: float) -> None:
+    """20 mm/s and at least 10°/s are allowed, and the controller follows at 1°/s per joint."""
+    fast = math.radians(turn_speed_deg)
+    robot = Robot(dataclasses.replace(CONFIG, joint_speed=MAX_SPEED_DEVIATION, max_turn_speed=fast))
     robot.step()
     half = math.radians(turn_deg) / 2
-    goal = Target((0.41, 0.008, 0.305), (0.0, math.sin(half), math.cos(half), 0.0), 1e9, 0.02, math.radians(10))
+    goal = Target((0.41, 0.008, 0.305), (0.0, math.sin(half), math.cos(half), 0.0), 1e9, 0.02, fast)
     robot.generator.set_target(goal, robot.now)
     previous: Joints | None = None
     speeds = []

@@ -14,6 +14,7 @@ from tests.real.runner.harness import OraclePolicy, events, mean_displacement, p
 from gelflow.cli.mock_lab import lab_for
 from gelflow.clock import ScaledClock
 from gelflow.errors import SafetyError
+from gelflow.geometry import Pose
 from gelflow.hardware_mocks.robot import MockRobot
 from gelflow.observation import FlowMap
 from gelflow.real.runner.insertion.attempt import Attempt, Insertion
@@ -90,9 +91,15 @@ def test_lost_part_ends_its_insertion_and_the_next_one_starts(robot: MockRobot, 
             robot.gripper.lose_part()
             lost.append(True)
 
-    results = run_insertions(plan_for(robot, tmp_path, OraclePolicy(robot, answer=lose), insertions=2))
+    plan = plan_for(robot, tmp_path, OraclePolicy(robot, answer=lose), insertions=2)
+    results = run_insertions(plan)
     assert [result.outcome for result in results] == ["part lost", "inserted"]
-    assert "part lost" in dict(events(tmp_path / "session.mcap"))
+    recorded = events(plan.session)
+    assert "part lost" in dict(recorded)
+    # The fingers still press: it is raised slowly enough to observe the pads.
+    names = [name for name, _ in recorded]
+    retreat = next(values for name, values in recorded[names.index("part lost") :] if name == "move")
+    assert retreat["speed"] < plan.lab.arm.max_speed
 
 
 def test_part_that_moves_in_the_grip_is_raised_and_handed_back(
@@ -186,20 +193,63 @@ class InterruptedGripper:
         return SimpleNamespace(width=0.05, grasp=self.grasp, fault="")
 
 
-def test_a_lost_part_is_not_reported_again_once_none_is_expected() -> None:
+class FakeArm:
+    """An arm at rest; counts its holds."""
+
+    def __init__(self) -> None:
+        self.holds = 0
+
+    def state(self) -> Any:
+        return SimpleNamespace(position=np.zeros(3), quaternion=np.array([1.0, 0.0, 0.0, 0.0]), stamp=0.0)
+
+    def target(self, *_: Any, **__: Any) -> None: ...
+
+    def hold(self) -> None:
+        self.holds += 1
+
+
+def executor_of(gripper: InterruptedGripper, clock: Any, arm: Any) -> MotionExecutor:
+    fakes: Any = {
+        "lab": SimpleNamespace(
+            arm=SimpleNamespace(max_speed=0.1, max_turn_speed_deg=10.0),
+            limits=SimpleNamespace(target_lifetime=0.1),
+            gripper_pose=Pose,
+            tool_pose=lambda target: target,
+        ),
+        "supervisor": SimpleNamespace(
+            phases=SimpleNamespace(require_motion=lambda: None), check=lambda goal, now, **_: goal
+        ),
+        "recorder": SimpleNamespace(event=lambda *_: None, check=lambda: None, arm_command=lambda *_, **__: None),
+    }
+    return MotionExecutor(arm, gripper, [], clock=clock, **fakes)  # type: ignore[arg-type]
+
+
+def test_a_guarded_motion_holds_when_its_caller_no_longer_observes_the_pads() -> None:
+    clock, arm = SimpleNamespace(seconds=0.0), FakeArm()
+    clock.now = lambda: clock.seconds
+    motion = executor_of(InterruptedGripper(), clock, arm)
+    motion.go(Pose(np.array([0.0, 0.0, 0.1]), np.array([1.0, 0.0, 0.0, 0.0])), guarded=True)
+    for clock.seconds in (0.2, 0.4, 0.6):
+        motion._hold_unobserved(clock.seconds)
+        assert motion.observed() and arm.holds == 0
+    clock.seconds = 0.9
+    motion._hold_unobserved(clock.seconds)
+    assert arm.holds == 1 and not motion.observed()
+    motion.go(Pose(np.array([0.0, 0.0, 0.1]), np.array([1.0, 0.0, 0.0, 0.0])), guarded=True)
+    assert motion.observed()
+    motion.hold()  # for another reason, such as a lost part: the motion does not continue
+    assert motion.observed()
+
+
+@pytest.mark.parametrize("reported", ["part lost", "idle", "error"])
+def test_a_lost_part_is_not_reported_again_once_none_is_expected(reported: str) -> None:
     """The watching thread runs while the runner states that no part is held any more."""
     gripper = InterruptedGripper()
-    fakes: Any = {
-        "lab": SimpleNamespace(arm=SimpleNamespace(max_speed=0.1, max_turn_speed_deg=10.0)),
-        "supervisor": SimpleNamespace(),
-        "recorder": SimpleNamespace(event=lambda *_: None, check=lambda: None),
-    }
-    arm: Any = SimpleNamespace(hold=lambda: None)
-    motion = MotionExecutor(arm, gripper, [], clock=ScaledClock(), **fakes)  # type: ignore[arg-type]
+    motion = executor_of(gripper, ScaledClock(), FakeArm())
     motion.expect_part(True)
-    gripper.grasp = "part lost"
+    gripper.grasp = reported
     motion.watch_part()
-    with pytest.raises(PartLost, match="the gripper reports that the part was lost"):
+    with pytest.raises(PartLost, match=f"the gripper reports {reported}, and holding before"):
         motion.wait(0.0)
     gripper.on_read = [threading.Thread(target=motion.watch_part)]
     motion.expect_part(False)

@@ -1,5 +1,6 @@
 """`gelflow robot` against the mock robot: the actions after a stop, and everything that is refused."""
 
+import contextlib
 import dataclasses
 import json
 import os
@@ -7,17 +8,19 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from tests.real.runner.harness import BackgroundRun, OraclePolicy, events, moving, plan_for, wait_for
-from tests.real.wsg.harness import Relay, unmodified
+from tests.real.wsg.harness import Relay, connected, unmodified
 
 from gelflow.cli.main import main
 from gelflow.cli.mock_lab import lab_for
 from gelflow.errors import GelflowError
 from gelflow.hardware_mocks.robot import MockRobot
 from gelflow.real.runner.lab_file import save_lab
+from gelflow.real.runner.manual import gripper_actions
 from gelflow.real.runner.run_plan import run_insertions
 from gelflow.real.wsg.codec import Decoder, Packet, plausible_request
 from gelflow.real.wsg.constants import Command
@@ -124,6 +127,29 @@ def test_a_stopped_run_is_cleared_by_jog_open_and_home(robot: MockRobot, tmp_pat
     code, printed = operator.run("home", answers="y\n")
     assert code == 0 and "home: done" in printed
     assert not robot.gripper.fast_stopped
+
+
+def test_home_releases_a_held_part_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The device accepts no other motion while it holds a part."""
+    questions: list[str] = []
+
+    def agreed(question: str, state: object) -> bool:
+        questions.append(question)
+        return True
+
+    with connected() as (gripper, _, plant, record):
+        gripper.home()
+        plant.set_part(0.040)
+        gripper.grasp(width=0.040, speed=0.4, force=20)
+        monkeypatch.setattr(gripper_actions, "_gripper", lambda session: contextlib.nullcontext(gripper))
+        session: Any = SimpleNamespace(
+            attended=True,
+            agreed=agreed,
+            lab=SimpleNamespace(gripper=SimpleNamespace(open_width=0.06, speed=0.4)),
+        )
+        assert gripper_actions.home(session)["done"]
+        assert record.names[-2:] == ["release", "home"] and plant.gripper_state()[0] == pytest.approx(0.110)
+    assert "hold it, the fingers release it" in questions[0]
 
 
 def test_fast_stop_is_acknowledged_by_an_operator_only(robot: MockRobot, operator: Operator) -> None:

@@ -18,6 +18,7 @@ from gelflow.hardware_mocks.robot import MockRobot
 from gelflow.real.runner.lab_file import save_lab
 from gelflow.real.runner.motion_executor import MotionExecutor
 from gelflow.real.runner.run_plan import run_insertions
+from gelflow.real.runner.touch.observer import TactileObserver, TactileReading
 from gelflow.session.reader import SessionReader
 
 
@@ -91,6 +92,35 @@ def test_a_stop_before_the_first_motion_moves_nothing(robot: MockRobot, tmp_path
     with pytest.raises(SafetyError, match="the operator pressed stop"):
         run_insertions(plan_for(robot, tmp_path, OraclePolicy(robot), on_motion=stop))
     assert robot.cell.arm_pose()[0] == pytest.approx(before, abs=1e-9)
+
+
+def test_a_stop_at_the_hand_over_does_not_close_the_fingers(
+    robot: MockRobot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A hand may be between them: the stop is pressed while the reference images are taken."""
+    executors: list[MotionExecutor] = []
+    at_rest = TactileObserver.at_rest
+
+    def stopped(observer: TactileObserver, since: float) -> list[TactileReading]:
+        executors[0].request_stop("the operator pressed stop")
+        return at_rest(observer, since)
+
+    monkeypatch.setattr(TactileObserver, "at_rest", stopped)
+    plan = plan_for(robot, tmp_path, OraclePolicy(robot), on_motion=executors.append)
+    with pytest.raises(SafetyError, match="the operator pressed stop"):
+        run_insertions(plan)
+    assert robot.cell.gripper_state()[0] == pytest.approx(plan.lab.gripper.open_width, abs=1e-3)
+
+
+def test_a_stop_before_the_preflight_ends_homes_no_fingers(robot: MockRobot, tmp_path: Path) -> None:
+    width = robot.cell.gripper_state()[0]
+    with pytest.raises(SafetyError, match="the operator pressed stop"):
+        run_insertions(
+            plan_for(
+                robot, tmp_path, OraclePolicy(robot), on_motion=lambda m: m.request_stop("the operator pressed stop")
+            )
+        )
+    assert robot.cell.gripper_state()[0] == pytest.approx(width, abs=1e-4)
 
 
 @pytest.mark.slow

@@ -36,6 +36,17 @@ def test_valid_target_is_not_changed() -> None:
     assert back.yaw == pytest.approx(target.yaw)
 
 
+def test_a_measured_pose_just_beyond_the_workspace_may_be_raised() -> None:
+    beyond = gripper(x=0.01605, y=-0.01609, yaw=math.radians(-16.05))
+    supervisor = Supervisor(LAB)
+    back = supervisor.within_workspace(beyond)
+    x, y, yaw, height = supervisor.hole_coordinates(back)
+    assert (x, y, math.degrees(yaw), height) == pytest.approx((0.016, -0.016, -16.0, 0.03), abs=1e-9)
+    check(back @ Pose(np.array([0.0, 0.0, 5e-3]), yaw_quaternion(0.0)), beyond)
+    for pose in (gripper(x=0.0162), gripper(x=0.01)):
+        assert supervisor.within_workspace(pose).position == pytest.approx(pose.position, abs=1e-12)
+
+
 @pytest.mark.parametrize(
     ("target", "named"),
     [

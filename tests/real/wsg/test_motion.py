@@ -200,6 +200,19 @@ def test_blocked_move_stops_and_raises() -> None:
         assert record.names[-1] == "stop"
 
 
+def test_empty_fingers_close_with_the_smallest_force() -> None:
+    with connected() as (gripper, _, plant, _):
+        gripper.home()
+        plant.set_part(0.040)
+        gripper.grasp(width=0.040, speed=0.4, force=60)
+        gripper.release(width=0.100, speed=0.4)
+        forces = []
+        command = plant.command_gripper
+        plant.command_gripper = lambda **values: (forces.append(values["force"]), command(**values))  # type: ignore
+        gripper.move(width=0.060, speed=0.4)
+        assert forces == [CONFIG.limits.force[0]]
+
+
 def test_lost_part_appears_in_the_state() -> None:
     with connected() as (gripper, server, plant, _):
         gripper.home()

@@ -19,9 +19,10 @@ from tests.real.wsg.harness import (
     wait_for_error,
 )
 
-from gelflow.errors import PeerError, SafetyError
+from gelflow.errors import PeerError, PeerTimeout, SafetyError
 from gelflow.protocols import GripperState
 from gelflow.real.transport import transport_for
+from gelflow.real.wsg.codec import Packet
 from gelflow.real.wsg.config import WsgConfig
 from gelflow.real.wsg.constants import Command
 from gelflow.real.wsg.driver import WsgGripper
@@ -83,6 +84,29 @@ def test_close_with_a_held_part_keeps_the_grip() -> None:
             assert other.state().grasp == "holding" and other.state().force == 20
             with pytest.raises(SafetyError, match="may be held"):
                 other.home()
+
+
+def test_close_after_a_grasp_without_a_result_stops_the_fingers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The stop after it was lost too: the device still reports that it grasps."""
+    with connected() as (gripper, _, plant, record):
+        gripper.home()
+        link = gripper._link
+        assert link is not None
+
+        def no_result(packet: Packet, *, timeout: float) -> None:
+            link.send(packet)
+            raise PeerTimeout("no result")
+
+        monkeypatch.setattr(link, "run", no_result)
+        monkeypatch.setattr(gripper, "_stop_after", lambda name, reason: None)
+        with pytest.raises(PeerTimeout):
+            gripper.grasp(width=0.010, speed=0.005, force=20)
+        eventually(lambda: gripper.state().grasp == "grasping", "the grasp did not start")
+        gripper.close()
+        assert record.names[-2:] == ["stop", "disconnect"]
+        width = plant.gripper_state()[0]
+        time.sleep(0.05)
+        assert plant.gripper_state()[0] == width > 0.09
 
 
 def test_unannounced_disconnect_leaves_fast_stop_and_the_held_part() -> None:

@@ -130,6 +130,7 @@ def test_json_output_agrees_with_the_model(name: str, law: str, capsys: pytest.C
     actuators = [actuator["name"] for joint in joints for actuator in joint["actuators"]]
     assert sorted(actuators) == sorted(sim.model.actuator_names)
     assert [pad["name"] for pad in description["pads"]] == list(sim.model.pad_names)
+    assert [pad["pitch_mm"] for pad in description["pads"]] == [pad.grid and pad.grid.pitch for pad in scene.pads]
     assert description["times"] is None
 
 

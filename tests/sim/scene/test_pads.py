@@ -82,7 +82,7 @@ def test_disc(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="pad 'pad' is not a rectangle and has no marker grid"):
         _ = scene.grids
     info = describe(scene).pads[0]
-    assert (info.shape, info.markers, info.rows, info.pitch) == ("disc", 130, None, None)
+    assert (info.shape, info.markers, info.rows, info.pitch_mm) == ("disc", 130, None, None)
 
 
 POINTS = np.array([[0.0, 0, 0.01], [0.01, 0, 0], [0, 0.01, 0], [0, 0, -0.01]])

@@ -119,6 +119,16 @@ def test_episodes_that_end_at_once_are_drawn_again_unless_kept() -> None:
         Line(2, tolerance=2.0).reset(np.ones(2, dtype=bool), rng)
 
 
+def test_results_of_the_batch_are_masks_of_a_reset() -> None:
+    batch, rng = Line(200), np.random.default_rng(0)
+    batch.reset(batch.all, rng)
+    for _ in range(3):
+        batch.step(np.zeros((200, 1)), rng)
+    assert batch.truncated.all()
+    batch.reset(batch.truncated, rng)
+    assert not (batch.terminated | batch.truncated).any()
+
+
 def test_step_of_active_environments_only() -> None:
     batch, rng = Line(3), np.random.default_rng(0)
     batch.reset(batch.all, rng, options={"x": [0.9, 0.6, -0.9]})

@@ -11,6 +11,8 @@ from tests.view.session.made_session import (
     CONTACT,
     GRASP_HEIGHT,
     HOLE_HEIGHT,
+    LAB,
+    LOOK,
     MOUNT,
     SHEAR,
     joints_at,
@@ -18,6 +20,7 @@ from tests.view.session.made_session import (
 )
 
 from gelflow.errors import PeerError, UsageError
+from gelflow.perception.synthetic.fast_renderer import FastGelRenderer
 from gelflow.protocols import CameraImage
 from gelflow.real.kinematics import HOME, forward, link_frames
 from gelflow.session import SessionRecorder, describe_session
@@ -189,6 +192,31 @@ def test_forces_of_the_pads_are_shown_where_they_are_recorded(tmp_path: Path) ->
         assert (drawn != empty).any()
 
 
+def test_forces_that_are_not_finite_are_shown(tmp_path: Path) -> None:
+    clock = ManualClock(100.0)
+    with SessionRecorder(tmp_path / "forces.mcap", clock) as recorder:
+        nan = float("nan")
+        force = {
+            "contact": True, "normal": nan, "normal_deviation": nan, "shear": [nan, 0.4], "shear_deviation": [nan, nan],
+            "stick_share": nan, "stick_share_deviation": nan, "gross_slip": False,
+        }  # fmt: skip
+        recorder.force(0, clock.time, force)
+    with RecordedSession(tmp_path / "forces.mcap") as session:
+        assert "left pad: normal nan ± nan N, shear nan N, sticks nan ± nan %" in moment_text(
+            session.at(session.end), session
+        )
+
+
+def test_an_event_named_state_without_a_phase_is_no_phase(tmp_path: Path) -> None:
+    clock = ManualClock(100.0)
+    with SessionRecorder(tmp_path / "own.mcap", clock) as recorder:
+        recorder.event("state")
+        recorder.event("state", {"temperature": 21.0})
+        recorder.event("state", {"state": "descend"})
+    with RecordedSession(tmp_path / "own.mcap") as session:
+        assert session.at(session.end).phase == "descend" and session.marks == []
+
+
 def test_links_of_the_arm_follow_each_other() -> None:
     rng = np.random.default_rng(0)
     for joints in (list(HOME), *rng.uniform(-1, 1, (5, 6)).tolist()):
@@ -263,6 +291,31 @@ def test_files_that_are_no_sessions_are_refused(tmp_path: Path) -> None:
         pass
     with pytest.raises(PeerError, match="nothing to show"):
         RecordedSession(tmp_path / "empty.mcap")
+
+
+def test_markers_of_a_growing_session_are_shown_once_an_image_is_readable(tmp_path: Path) -> None:
+    clock, path, renderer = ManualClock(5.0), tmp_path / "session.mcap", FastGelRenderer(LOOK)
+    black = cv2.imencode(".jpg", np.zeros((480, 640, 3), dtype=np.uint8))[1].tobytes()
+    with SessionRecorder(path, clock) as recorder:
+        recorder.metadata(
+            describe_session(task=INSERTION, trackers=[MOUNT.tracker_config()] * 2, mounts=[MOUNT] * 2, lab=LAB)
+        )
+        recorder.image(0, CameraImage(black, clock.time, 0))
+        recorder.attempt_end()  # stores everything
+        with RecordedSession(path) as session:
+            pad = session.markers.pad(0, session.end)
+            assert pad is not None and pad.tracked is None and pad.problem
+            for number in range(1, 40):
+                clock.time = 5.0 + 0.1 * number
+                if number == 5:
+                    recorder.event("state", {"state": "descend"})
+                picture = renderer.render(np.zeros_like(LOOK.positions_mm()), sequence=number)
+                recorder.image(0, CameraImage(renderer.encode(picture), clock.time, number))
+            recorder.attempt_end()
+            assert session.refresh()
+            pad = session.markers.pad(0, session.end)
+            assert pad is not None and pad.problem == ""
+            assert pad.tracked is not None and pad.tracked.valid.mean() > 0.9
 
 
 def test_a_session_that_is_being_recorded_grows(tmp_path: Path) -> None:

@@ -56,6 +56,7 @@ def run(args: argparse.Namespace) -> int:
     """Measure and print tables. A negative result: a timed run was too far from its converged reference."""
     from gelflow.measurement.machine import processor
     from gelflow.measurement.timing import QUICK_REPEATS, REPEATS, BenchmarkOptions
+    from gelflow.policies.training.folder import create_folder
     from gelflow.toml_tables import suggestion
 
     quick = args.quick or not args.what
@@ -66,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
         if name not in MEASUREMENTS:
             raise UsageError(f"no measurement {name!r}; {suggestion(name, tuple(MEASUREMENTS))}")
     if args.out is not None:
-        _make_folder(args.out)
+        create_folder(args.out)
     output = Output(args.json, width=WIDTH)
     output.console.print(f"{processor()}. Medians of {repeats} repeats; the cases of a table run in turn.")
     reports: list[Report] = []
@@ -78,12 +79,13 @@ def run(args: argparse.Namespace) -> int:
             _show(output, report, markdown=args.markdown)
         reports += measured
     record = _record(reports, quick=quick, repeats=repeats)
+    output.result(record)
+    status = conclude(reports, output)
     if args.out is not None:
         file = args.out / "bench.json"
         file.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
         output.text(f"written: {file}")
-    output.result(record)
-    return conclude(reports, output)
+    return status
 
 
 def conclude(reports: "Sequence[Report]", output: Output) -> int:
@@ -92,13 +94,6 @@ def conclude(reports: "Sequence[Report]", output: Output) -> int:
     for line in violations:
         output.text(f"outside the bounds: {line}")
     return NEGATIVE_RESULT if violations else SUCCESS
-
-
-def _make_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UsageError(f"--out {folder}: cannot create the folder: {error.strerror}") from None
 
 
 def _measure(name: str, options: "BenchmarkOptions", args: argparse.Namespace) -> "list[Report]":

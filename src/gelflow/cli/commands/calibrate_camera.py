@@ -1,6 +1,7 @@
 """`gelflow calibrate-camera`: camera calibration in millimetres from one image of the gel at rest."""
 
 import argparse
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from gelflow.perception.mount_check import VisiblePart, find_visible_part, lines
 from gelflow.perception.output.camera_calibration_picture import draw_calibration
 from gelflow.perception.output.init_error import picture_of_init_error
 from gelflow.perception.sensors.profile import load_sensor_profile
-from gelflow.perception.sources import ImageSource, image_source
+from gelflow.perception.sources import ImageSource, SourceImage, image_source, start_on_image
 from gelflow.perception.tracker import MarkerTracker, TrackingResult
 
 _UNEVEN, _SMOOTH = 0.02, 0.5  # residual [spacings] and its smooth share that may be a touched gel
@@ -70,9 +71,10 @@ def run(args: argparse.Namespace) -> int:
         )
     if args.rows is None and args.cols is None and profile.markers.rows:
         args.rows, args.cols = profile.markers.rows, profile.markers.cols
-    image = _first_image(image_source(args.source, sensor=args.sensor, profile=profile))
+    source = image_source(args.source, sensor=args.sensor, profile=profile)
     with picture_of_init_error(args.out):
-        tracker, first, part = _start(image, args)
+        frame, (tracker, first, part) = start_on_image(source, _images(source), lambda image: _start(image, args))
+    image = frame.image
     rest, measured = tracker.rest, first.valid
     size = (image.shape[1], image.shape[0])
     fit = fit_calibration(
@@ -114,12 +116,14 @@ def run(args: argparse.Namespace) -> int:
     return SUCCESS
 
 
-def _first_image(source: ImageSource) -> NDArray[np.uint8]:
-    """The first image. Raises PeerError when it cannot be read: a later one may not show the gel at rest."""
-    image = next(iter(source)).image
-    if source.skipped.unreadable:
-        raise PeerError(source.skipped.first)
-    return image
+def _images(source: ImageSource) -> Iterator[SourceImage]:
+    """The images of `source`. Raises PeerError when the first one of a recorded source cannot be read: a later one may
+    not show the gel at rest.
+    """
+    for image in source:
+        if source.skipped.unreadable and not source.live:
+            raise PeerError(source.skipped.first)
+        yield image
 
 
 def _start(

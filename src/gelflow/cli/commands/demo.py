@@ -2,6 +2,7 @@
 
 import argparse
 import math
+import re
 import shlex
 import sys
 import time
@@ -25,12 +26,14 @@ from gelflow.cli.options import (
     add_seed,
     add_view,
     check_at_least,
+    check_page_address,
     checkpoint_for,
     part_task,
 )
 from gelflow.cli.output import Output, progress_bar
 from gelflow.errors import GelflowError, PeerTimeout, UsageError
 from gelflow.interrupts import interruptible
+from gelflow.session.reader import is_being_recorded
 from gelflow.task import InsertionTask
 
 if TYPE_CHECKING:
@@ -43,6 +46,7 @@ if TYPE_CHECKING:
 _DELAY_NOTE = 0.1  # share of the wall time that robot time must have waited for a note below the table
 _FOLDER = Path("out/demo")  # unless --out names another one
 _MARKER = ".gelflow-demo"  # in a folder whose sessions and pictures are those of a demo
+_WRITTEN = re.compile(r"session(-real-time)?\.mcap|insertion-(real-time-)?\d+\.png")  # names of its files
 _EPISODES = 100  # parts in simulation without the mock robot
 
 
@@ -67,13 +71,14 @@ def run(args: argparse.Namespace) -> int:
     from gelflow.policies.checkpoint import load_policy
 
     check_at_least(args, insertions=1, seed=0)
+    check_page_address(args, "view")
     # With the default of 5 ms a computing thread delays the threads of gripper and cameras.
     sys.setswitchinterval(5e-4)
     output = Output(args.json)
     task = part_task(args.part)
     checkpoint = checkpoint_for(task, args.checkpoint)
     policy = load_policy(checkpoint, task=task)
-    _clear(args.out)
+    _earlier_files(args.out)
     with live_page(args, output) as view:
         results = _run_all(output, args, policy, task, checkpoint, view)
     first = results[0]
@@ -110,7 +115,7 @@ def _run_all(
         count=count, factor=args.factor, seed=args.seed, preset=args.preset,
         title=f"Insertions with the mock robot at {args.factor:g} times real time", view=view,
     )  # fmt: skip
-    results = [_run_series(output, plan)]
+    results = [_run_series(output, plan, clear=True)]
     if not (args.no_real_time or args.quick) and results[0].error is None:
         plan = replace(
             plan, count=1, factor=1.0, seed=args.seed + count, title="One more in real time (factor 1)",
@@ -173,8 +178,11 @@ class _Observer:
         self.output.text(f"{result.number + 1:6d}  {result.outcome} after {result.duration:.0f} s of robot time")
 
 
-def _run_series(output: Output, series: _Series) -> _SeriesResult:
-    """Start a mock robot, insert the parts, draw the pictures, and print the table."""
+def _run_series(output: Output, series: _Series, *, clear: bool = False) -> _SeriesResult:
+    """Start a mock robot, insert the parts, draw the pictures, and print the table.
+
+    `clear` removes the files of an earlier demo once the mock robot has started, which checks the options.
+    """
     from gelflow.cli.live_page import motion_observer
     from gelflow.real.runner.lab_file import load_lab
     from gelflow.real.runner.run_plan import RunPlan, run_insertions
@@ -183,6 +191,8 @@ def _run_series(output: Output, series: _Series) -> _SeriesResult:
     robot = mock_robot(factor=series.factor, seed=series.seed, preset=series.preset, part=series.part)
     with robot as (lab_path, truth_url):
         lab = load_lab(lab_path)
+        if clear:
+            _clear(series.out)
         output.console.print(series.title, style="bold")
         output.text(f"{lab.gripper.address}, UDP {lab.arm.egm_port}, two MJPEG cameras")
         output.text(ATTEMPT_HEADER)
@@ -301,16 +311,30 @@ def _to_json(session: Path, results: list[_SeriesResult], evaluations: "list[Eva
     }
 
 
-def _clear(out: Path) -> None:
-    """Remove the files of an earlier demo. Raises UsageError when such files in `out` are of something else."""
-    marker = out / _MARKER
+def _earlier_files(out: Path) -> list[Path]:
+    """The files of an earlier demo in the folder `out`, which is created if it does not exist.
+
+    Raises UsageError when it cannot be created, or files with these names are of something else or are being recorded.
+    """
     try:
         out.mkdir(parents=True, exist_ok=True)
-        old = [path for pattern in ("session*.mcap", "insertion-*.png") for path in sorted(out.glob(pattern))]
-        if old and not marker.exists():
+        old = sorted(path for path in out.iterdir() if _WRITTEN.fullmatch(path.name))
+        if old and not (out / _MARKER).exists():
             raise UsageError(f"{old[0]} is not the file of a demo; name another folder with --out")
         for path in old:
+            with path.open("rb") as stream:
+                if is_being_recorded(stream):
+                    raise UsageError(f"another demo records {path}; wait for its end or name another --out")
+    except OSError as error:
+        raise UsageError(f"cannot write to {out}: {error.strerror}; name another folder with --out") from error
+    return old
+
+
+def _clear(out: Path) -> None:
+    """Remove the files of an earlier demo. Raises UsageError as `_earlier_files`."""
+    try:
+        for path in _earlier_files(out):
             path.unlink()
-        marker.touch()
+        (out / _MARKER).touch()
     except OSError as error:
         raise UsageError(f"cannot write to {out}: {error.strerror}; name another folder with --out") from error

@@ -165,14 +165,14 @@ def _add_contact(at: Tree, contact: "ContactPart") -> None:
 
 
 def _add_pad(at: Tree, pad: "PadPart") -> None:
-    if pad.pitch is None:
+    if pad.pitch_mm is None:
         markers = (
             f"{pad.markers} markers at given points"
             if pad.shape == "points"
             else f"{pad.markers} markers, a {pad.shape}"
         )
     else:
-        markers = f"{pad.rows} × {pad.cols} markers, {pad.pitch:g} mm apart"
+        markers = f"{pad.rows} × {pad.cols} markers, {pad.pitch_mm:g} mm apart"
     text = f"{markers}, on {pad.body} against {', '.join(pad.against)}"
     text += ", which they push" if pad.collides else ""
     branch = at.add(f"[cyan]{escape(pad.name)}[/cyan]: {escape(text)}")

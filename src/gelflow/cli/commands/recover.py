@@ -20,13 +20,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Recover the session, then print the number of recovered and lost records."""
     output = Output(args.json)
-    target = args.out or args.session.with_name(f"{args.session.stem}.recovered.mcap")
+    target = args.out or args.session.parent / f"{args.session.stem}.recovered.mcap"
     with progress_bar() as progress:
         progress.add_task("recovering", total=None)
         report = recover(args.session, target)
     output.text(f"recovered: {report.messages} records over {report.duration:.2f} s of robot time")
     if report.lost_bytes:
-        output.text(f"lost: {report.lost_bytes} bytes of an incomplete record at the end")
+        output.text(f"lost: {report.lost_bytes} bytes of incomplete or damaged records")
     if report.damaged_chunks:
         output.text(f"lost: {report.damaged_chunks} chunks or records with damaged contents")
     output.text(f"written: {report.path}")

@@ -25,6 +25,7 @@ from gelflow.cli.options import (
     add_part,
     add_view,
     check_at_least,
+    check_page_address,
     checkpoint_for,
     part_task,
 )
@@ -67,6 +68,7 @@ def run(args: argparse.Namespace) -> int:
     from gelflow.real.runner.run_plan import RunPlan, run_insertions
 
     check_at_least(args, insertions=1)
+    check_page_address(args, "view")
     # With the default of 5 ms a computing thread delays the threads of gripper and cameras.
     sys.setswitchinterval(5e-4)
     output = Output(args.json)

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from gelflow.real.soak.ledger import Ledger
 
 _FAILED_STARTS = 3  # of the mock robot, in sequence, after which the soak test ends
+_PLANS_ONLY = {"plans": 20, "factor": 2.0, "jitter": 0.1, "jobs": 1, "seed": 0, "preset": None}  # with defaults
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -43,7 +44,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run what the options name. Negative: a rule was violated, or a promise or a bound did not hold."""
+    """Run what the options name.
+
+    Negative: a rule was violated, a promise or a bound did not hold, or a plan did not run.
+    """
+    _check_options(args)
     if args.promises:
         return _run_promises(args)
     if args.egm is not None:
@@ -51,15 +56,29 @@ def run(args: argparse.Namespace) -> int:
     return _run_plans(args)
 
 
+def _check_options(args: argparse.Namespace) -> None:
+    """Raise UsageError for an option without effect."""
+    if args.promises and args.egm is not None:
+        raise UsageError("--promises and --egm are different tests; name one of them")
+    other = "--promises" if args.promises else "--egm" if args.egm is not None else ""
+    for name, default in _PLANS_ONLY.items():
+        if other and getattr(args, name) != default:
+            raise UsageError(f"--{name} is for random plans, and {other} runs none")
+    if args.egm is not None and args.only is not None:
+        raise UsageError("--only names a plan or a promise, and --egm runs none")
+
+
 def _run_promises(args: argparse.Namespace) -> int:
     """Measure the promises one after the other."""
     from gelflow.cli.promises.outcome import Row, measure
     from gelflow.cli.promises.report import remarks, table, to_json, write_json
     from gelflow.cli.promises.table import PROMISES
+    from gelflow.policies.training.folder import create_folder
 
     output = Output(args.json)
     if args.only is not None and args.only not in PROMISES:
         raise UsageError(f"there is no promise {args.only!r}; {suggestion(args.only, PROMISES)}")
+    create_folder(args.out)
     chosen = [PROMISES[args.only]] if args.only is not None else list(PROMISES.values())
     rows: list[Row] = []
     with progress_bar(count=True) as progress:
@@ -72,8 +91,8 @@ def _run_promises(args: argparse.Namespace) -> int:
         output.text(line)
     result = to_json(rows)
     output.text(f"{sum(row.held for row in rows)} of {len(rows)} promises held; load {result['load']}")
-    write_json(args.out / "promises.json", result)
     output.result(result)
+    write_json(args.out / "promises.json", result)
     return SUCCESS if all(row.held for row in rows) else NEGATIVE_RESULT
 
 
@@ -81,17 +100,19 @@ def _run_endurance(args: argparse.Namespace) -> int:
     """Run EGM with cameras, tracking and recording for some minutes."""
     from gelflow.cli.promises.endurance import BOUND, measure_endurance
     from gelflow.cli.promises.report import write_json
+    from gelflow.policies.training.folder import create_folder
 
     if not 0 < args.egm <= 1440:
         raise UsageError(f"--egm must be above 0 and at most 1440 minutes, got {args.egm:g}")
+    create_folder(args.out)
     output = Output(args.json)
     with progress_bar() as progress:
         bar = progress.add_task("EGM", total=60 * args.egm)
         result = measure_endurance(60 * args.egm, lambda elapsed: progress.update(bar, completed=elapsed))
     for line in result.lines():
         output.text(line)
-    write_json(args.out / "egm.json", result.to_json())
     output.result(result.to_json())
+    write_json(args.out / "egm.json", result.to_json())
     return SUCCESS if result.missed <= BOUND and not result.stops else NEGATIVE_RESULT
 
 
@@ -105,19 +126,24 @@ def _run_plans(args: argparse.Namespace) -> int:
     load_scene("insertion", preset=args.preset)  # raises for an unknown preset
     only = None if args.only is None else _seed(args.only)
     output = Output(args.json)
-    ledger = Ledger(args.out / "soak.jsonl")
+    ledger = Ledger(args.out / "soak.jsonl", factor=args.factor, jitter=args.jitter, preset=args.preset)
     seeds = [only] if only is not None else range(args.seed, args.seed + args.plans)
     left = [seed for seed in seeds if only is not None or seed not in ledger.rows]
     if len(left) < len(seeds):
         output.text(f"{len(seeds) - len(left)} of {len(seeds)} plans are in {args.out} already.")
     cases = [SoakCase.of(seed, factor=args.factor, jitter=args.jitter, preset=args.preset) for seed in left]
-    _run_all(cases, ledger, output, args)
+    not_run = _run_all(cases, ledger, output, args)
     if only is not None:
+        if not_run:
+            raise PeerError(f"plan {only} did not run: {not_run[only]}")
         output.result({"rows": [ledger.rows[only]]})
         return NEGATIVE_RESULT if ledger.rows[only]["violations"] else SUCCESS
     _show(output, ledger)
-    output.result({"plans": len(ledger.rows), "failing": ledger.failing(), **ledger.counts()})
-    return NEGATIVE_RESULT if ledger.failing() else SUCCESS
+    if not_run:
+        output.text(f"not run: {' '.join(map(str, not_run))}; the same command runs them")
+    result = {"plans": len(ledger.rows), "failing": ledger.failing(), "not_run": list(not_run)}
+    output.result(result | ledger.counts())
+    return NEGATIVE_RESULT if ledger.failing() or not_run else SUCCESS
 
 
 def _seed(text: str) -> int:
@@ -126,11 +152,15 @@ def _seed(text: str) -> int:
     return int(text)
 
 
-def _run_all(cases: "list[SoakCase]", ledger: "Ledger", output: Output, args: argparse.Namespace) -> None:
-    """Run the cases, `--jobs` at a time; raises PeerError when the mock robot repeatedly fails to start."""
+def _run_all(cases: "list[SoakCase]", ledger: "Ledger", output: Output, args: argparse.Namespace) -> dict[int, str]:
+    """Run the cases, `--jobs` at a time; returns the seeds of those that did not run, with the reason.
+
+    Raises PeerError when the mock robot repeatedly fails to start.
+    """
     from gelflow.cli.soak_case import try_case
 
     failed = 0
+    not_run: dict[int, str] = {}
     with progress_bar(count=True) as progress, ThreadPoolExecutor(args.jobs) as pool:
         bar = progress.add_task("plans", total=len(cases))
         waiting = list(cases)
@@ -143,6 +173,7 @@ def _run_all(cases: "list[SoakCase]", ledger: "Ledger", output: Output, args: ar
                 case, row = running.pop(done), done.result()
                 failed = failed + 1 if isinstance(row, str) else 0
                 if isinstance(row, str):
+                    not_run[case.seed] = row
                     output.text(f"plan {case.seed} did not run: {row}")
                     if failed >= _FAILED_STARTS:
                         raise PeerError(f"{failed} plans in sequence did not run: {row}")
@@ -150,6 +181,7 @@ def _run_all(cases: "list[SoakCase]", ledger: "Ledger", output: Output, args: ar
                     ledger.add(case.seed, row)
                     output.text(_line(case.seed, row))
                 progress.advance(bar)
+    return not_run
 
 
 def _line(seed: int, row: dict[str, Any]) -> str:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
 
+from gelflow.cli import options
 from gelflow.cli.exit_codes import SUCCESS
 from gelflow.cli.options import add_json, add_page_address, add_profile, check_at_least, check_new_file, delete_empty
 from gelflow.cli.output import Output, progress_bar
@@ -20,7 +21,7 @@ from gelflow.errors import UsageError
 from gelflow.gel.gel_file import ElasticGel, load_gel
 from gelflow.perception.camera_calibration import CameraCalibration, load_calibration
 from gelflow.perception.errors import TrackerInitError
-from gelflow.perception.force.image_forces import GridScale, ImageForces
+from gelflow.perception.force.image_forces import GridAxes, GridScale, ImageForces
 from gelflow.perception.force.recorded_pad import RecordedPad, recorded_pad
 from gelflow.perception.grid_detection.grid_part import Polarity
 from gelflow.perception.mount_check import VisiblePart, check_calibrated_scale, find_visible_part, lines_text
@@ -29,7 +30,7 @@ from gelflow.perception.output.init_error import picture_of_init_error
 from gelflow.perception.output.summary import TrackingSummary
 from gelflow.perception.output.writers import TrackedImage, TrackWriter, check_suffix, open_writer
 from gelflow.perception.sensors.profile import SensorProfile, load_sensor_profile
-from gelflow.perception.sources import ImageSource, SkippedImages, SourceImage, image_source
+from gelflow.perception.sources import ImageSource, SkippedImages, SourceImage, image_source, start_on_image
 from gelflow.perception.tracker import MarkerTracker, TrackerConfig, TrackingResult
 from gelflow.session.records import software_versions
 
@@ -127,6 +128,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _check(args: argparse.Namespace) -> None:
     check_at_least(args, images=1)
+    options.check_page_address(args, "show")
     if args.pixels_per_mm is not None and not 0 < args.pixels_per_mm < float("inf"):
         raise UsageError(f"--pixels-per-mm must be above 0, got {args.pixels_per_mm:g}")
     if not args.magnify > 0:
@@ -166,28 +168,24 @@ def _track(
         total = args.images if total is None else min(total, args.images)
     with ExitStack() as open_files, progress_bar(count=True) as progress:
         bar = progress.add_task("tracking", total=total)
-        writers: list[TrackWriter] = []
-        tracker, forces = MarkerTracker(), None
-        for number, frame in enumerate(itertools.islice(source, args.images)):
-            if number == 0 and calibration is not None:
-                calibration.check_size(frame.image)
-            begin = time.perf_counter()
-            with picture_of_init_error((args.out or [Path("track")])[0]):
-                if number == 0:
-                    tracker, tracked, summary.visible = _start(frame.image, calibration, args)
-                else:
-                    tracked = tracker.track(frame.image)
-            seconds = time.perf_counter() - begin
-            if number == 0:
-                summary.pixels_per_mm = _scale(tracked, source, calibration, args)
-                # Files are created after the first image: a failed start leaves no empty files.
-                forces = _forces(tracked, calibration, summary.pixels_per_mm, args)
-                writers = [open_files.enter_context(closing(writer)) for writer in _writers(args, calibration, summary)]
-                writers += [] if page is None else [page]
-            elif page is not None and page.take_zero_request() and (started := _zeroed(tracker, tracked, frame, page)):
-                tracker, tracked = started
-                if forces is not None:
-                    forces.reset()
+        images = iter(source)
+        with picture_of_init_error((args.out or [Path("track")])[0]):
+            first, started = start_on_image(source, images, lambda image: _start(image, calibration, args))
+        tracker, tracked, summary.visible, seconds = started
+        summary.pixels_per_mm = _scale(tracked, source, calibration, args)
+        # Files are created after the first image: a failed start leaves no empty files.
+        forces = _forces(tracked, calibration, summary.pixels_per_mm, args)
+        writers = [open_files.enter_context(closing(writer)) for writer in _writers(args, calibration, summary)]
+        writers += [] if page is None else [page]
+        for number, frame in enumerate(itertools.islice(itertools.chain([first], images), args.images)):
+            if number:
+                begin = time.perf_counter()
+                tracked = tracker.track(frame.image)
+                seconds = time.perf_counter() - begin
+                if page is not None and page.take_zero_request() and (zero := _zeroed(tracker, tracked, frame, page)):
+                    tracker, tracked = zero
+                    if forces is not None:
+                        forces.reset()
             step = _tracked_image(number, frame, tracked, calibration, summary.pixels_per_mm)
             if forces is not None and step.displacement_mm is not None:
                 force = forces.estimate(step.displacement_mm, tracked.valid, frame.stamp)
@@ -200,8 +198,13 @@ def _track(
 
 def _start(
     image: NDArray[np.uint8], calibration: CameraCalibration | None, args: argparse.Namespace
-) -> tuple[MarkerTracker, TrackingResult, list[VisiblePart]]:
-    """A tracker started on the first image, its result, and the possible visible parts of a partly visible grid."""
+) -> tuple[MarkerTracker, TrackingResult, list[VisiblePart], float]:
+    """A tracker started on the first image, its result, the possible visible parts of a partly visible grid, and the
+    duration of the start [s].
+    """
+    begin = time.perf_counter()
+    if calibration is not None:
+        calibration.check_size(image)
     polarity: Polarity = "dark" if args.dark else "bright" if args.bright else "auto"
     parts: list[VisiblePart] = []
     config = TrackerConfig(rows=args.rows, cols=args.cols, polarity=polarity)
@@ -221,7 +224,7 @@ def _start(
         first = tracker.start(image)
     if calibration is not None:
         check_calibrated_scale(calibration, first)
-    return tracker, first, parts
+    return tracker, first, parts, time.perf_counter() - begin
 
 
 def _zeroed(
@@ -289,12 +292,12 @@ def _forces(
     if args.gel is None:
         return None
     if calibration is not None:
-        grid = GridScale(calibration.spacing_mm, first.spacing / calibration.spacing_mm)
+        grid, axes = GridScale(calibration.spacing_mm, first.spacing / calibration.spacing_mm), None
     elif scale is not None:
-        grid = GridScale(first.spacing / scale, scale)
+        grid, axes = GridScale(first.spacing / scale, scale), GridAxes.of(first.position, first.rows, first.cols)
     else:
         raise UsageError("--gel needs millimetres: give --calibration, --pixels-per-mm or a --profile with a pitch")
-    return ImageForces(args.gel, first.rows, first.cols, grid)
+    return ImageForces(args.gel, first.rows, first.cols, grid, axes)
 
 
 def _writers(

@@ -11,6 +11,8 @@ from rich.table import Table
 from gelflow.cli.exit_codes import SUCCESS
 from gelflow.cli.options import add_json, add_out, add_quick, add_repeats, check_at_least
 from gelflow.cli.output import Output, progress_bar
+from gelflow.errors import UsageError
+from gelflow.figures import PICTURE_FORMATS
 
 if TYPE_CHECKING:
     from gelflow.sim.benchmark.tradeoff.sweep import Measurement, Tradeoff
@@ -38,9 +40,14 @@ def run(args: argparse.Namespace) -> int:
     check_at_least(args, repeats=1)
     repeats = args.repeats if args.repeats is not None else 3 if args.quick else 9
     from gelflow.measurement.machine import processor
+    from gelflow.policies.training.folder import create_folder
     from gelflow.sim.benchmark.tradeoff.picture import draw
     from gelflow.sim.benchmark.tradeoff.sweep import measure
 
+    if args.out is not None:
+        if args.out.suffix.lower() not in PICTURE_FORMATS:
+            raise UsageError(f"--out {args.out}: the suffix must be one of {', '.join(PICTURE_FORMATS)}")
+        create_folder(args.out.parent)
     output = Output(args.json)
     with progress_bar() as progress:
         task = progress.add_task("reference", total=1.0)
@@ -51,13 +58,13 @@ def run(args: argparse.Namespace) -> int:
             done=lambda what, share: progress.update(task, description=what, completed=share),
         )
     picture = args.out or (None if output.json else Path("out") / f"tradeoff_{measured.scene}.png")
-    if picture is not None:
-        draw(measured, picture)
     if output.json:
         output.result(dataclasses.asdict(measured) | {"processor": processor()})
-        return SUCCESS
-    show(measured, f"{measured.scene}, one thread of {processor()}", output)
-    output.text(f"picture: {picture}")
+    else:
+        show(measured, f"{measured.scene}, one thread of {processor()}", output)
+    if picture is not None:
+        draw(measured, picture)
+        output.text(f"picture: {picture}")
     return SUCCESS
 
 

@@ -44,6 +44,7 @@ class MarkerReader:
         except UsageError as error:
             self.problem = str(error)
         self._trackers: dict[int, MarkerTracker | str] = {}
+        self._tried: dict[int, float] = {}  # duration of the session when a tracker was started last [s]
         self._references: OrderedDict[tuple[int, float], TrackingResult] = OrderedDict()
         self._recorded = {f"/{sensor}/markers" for sensor in SENSORS} & set(index.topics())
 
@@ -119,10 +120,14 @@ class MarkerReader:
         return self._references[key]
 
     def _tracker(self, sensor: int) -> MarkerTracker:
-        """The tracker of a pad, which started on the first readable image. Raises PeerError if there is none."""
-        if sensor not in self._trackers:
-            self._trackers[sensor] = self._started(sensor)
-        found = self._trackers[sensor]
+        """The tracker of a pad, which started on the first readable image. Raises PeerError if there is none.
+
+        While a session grows, a failed start is repeated each time its duration has doubled: it takes some 0.1 s.
+        """
+        found, duration = self._trackers.get(sensor), self._index.end - self._index.start
+        if found is None or (isinstance(found, str) and duration > 2 * self._tried[sensor]):
+            found = self._trackers[sensor] = self._started(sensor)
+            self._tried[sensor] = duration
         if isinstance(found, str):
             raise PeerError(found)
         return found

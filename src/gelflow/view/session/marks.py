@@ -29,7 +29,8 @@ class Mark:
 
 def phases(events: Sequence[Record]) -> list[tuple[float, str]]:
     """Times [s] and names of the phases of a run."""
-    return [(e.stamp, str(e.value["values"]["state"])) for e in events if e.value["name"] == "state"]
+    states = [event for event in events if event.value["name"] == "state" and "state" in event.value["values"]]
+    return [(event.stamp, str(event.value["values"]["state"])) for event in states]
 
 
 def descents(run: Sequence[tuple[float, str]]) -> list[float]:

@@ -59,16 +59,20 @@ def gripper_text(moment: Moment) -> str:
 
 
 def force_text(force: Mapping[str, Any]) -> str:
-    """Normal force, shear force and slip of a pad in words; `force` is a record of `gelflow.Force`."""
+    """Normal force, shear force and slip of a pad in words; `force` is a record of `gelflow.Force`.
+
+    A number that is not finite is recorded as a string.
+    """
     if not force["contact"]:
         return "no contact"
-    text = (
-        f"normal {force['normal']:.2f} ± {force['normal_deviation']:.2f} N, shear {math.hypot(*force['shear']):.2f} N"
-    )
+    normal, deviation, shear = float(force["normal"]), float(force["normal_deviation"]), map(float, force["shear"])
+    text = f"normal {normal:.2f} ± {deviation:.2f} N, shear {math.hypot(*shear):.2f} N"
     if force.get("gross_slip"):
         return f"{text}, **gross slip**"
-    share, deviation = force.get("stick_share"), force.get("stick_share_deviation")
-    return text if share is None or deviation is None else f"{text}, sticks {100 * share:.0f} ± {100 * deviation:.0f} %"
+    share, spread = force.get("stick_share"), force.get("stick_share_deviation")
+    if share is None or spread is None:
+        return text
+    return f"{text}, sticks {100 * float(share):.0f} ± {100 * float(spread):.0f} %"
 
 
 def comparison_text(comparison: Comparison) -> str:

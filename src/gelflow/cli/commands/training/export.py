@@ -6,6 +6,7 @@ from pathlib import Path
 from gelflow.cli.exit_codes import SUCCESS
 from gelflow.cli.options import add_json, add_out
 from gelflow.cli.output import Output
+from gelflow.errors import UsageError
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -17,6 +18,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Export the policy and print the path of the model."""
+    if not args.checkpoint.name:
+        raise UsageError(f"{args.checkpoint} is no checkpoint; name a file that gelflow train has written")
     from gelflow.policies.onnx_export import export  # deferred: torch is slow to import
 
     out = args.out or args.checkpoint.with_suffix(".onnx")

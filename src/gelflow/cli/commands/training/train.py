@@ -40,7 +40,8 @@ _DEFAULT = "imitation"
 _SHIPPED = Path("shipped")  # --start without a file
 _STEPS = (
     "environment steps in total, for the insertion attempts (default: insertion 400000, with --start 80000, with "
-    "--algorithm ppo 200000; grasp 20480; cap 400000; pushing 480000)"
+    "--algorithm ppo 200000; grasp 20480; cap 400000, with --recipe published or published-no-touch 2400000; "
+    "pushing 480000)"
 )
 _ALGORITHMS = (_DEFAULT, "ppo")
 

@@ -56,14 +56,15 @@ def run(args: argparse.Namespace) -> int:
     """Execute the runs that are not complete, then write and print the results of all."""
     check_at_least(args, jobs=1, tries=1)
     from gelflow.policies.sweep.grid import read_grid
-    from gelflow.policies.sweep.sweep import execute_runs, incomplete, sweep_folder
+    from gelflow.policies.sweep.sweep import execute_runs, incomplete, store_grid_file, sweep_folder
 
     output = Output(args.json)
     grid = read_grid(args.grid, train_options())
     folder = (args.out or Path("runs") / args.grid.stem).resolve()
     runs = grid.runs(folder)
-    with interruptible(), sweep_folder(folder, args.grid):
+    with interruptible(), sweep_folder(folder):
         remaining = incomplete(runs)
+        store_grid_file(folder, args.grid)
         output.text(f"{len(runs)} runs in {folder}, {len(runs) - len(remaining)} of them complete")
         if remaining:
             with progress_bar(count=True) as progress, _engine(args, grid, folder) as engine:
