@@ -218,8 +218,8 @@ def start_on_image(
 ) -> tuple[SourceImage, T]:
     """The first of `images`, those of `source`, and the result of `start` for it.
 
-    Raises the TrackerInitError of `start`. In a live source, images on which `start` fails are skipped and counted for
-    2 s before.
+    Raises the TrackerInitError of `start`: at once for a recorded source; for a live one after 2 s or at its end, and
+    the images until then are skipped and counted.
     """
     limit = math.inf
     failed: TrackerInitError | None = None

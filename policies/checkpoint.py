@@ -45,12 +45,12 @@ class Checkpoint:
 
 
 def default_checkpoint() -> Path:
-    """Path of the insertion policy that is shipped with gelflow."""
+    """Path of the insertion policy that is included in gelflow."""
     return _SHIPPED / "insertion.safetensors"
 
 
 def shipped_checkpoints() -> list[Path]:
-    """Paths of all policies that are shipped with gelflow, former ones included: recorded sessions name them."""
+    """Paths of all policies that are included in gelflow, former ones included: recorded sessions name them."""
     return sorted(_SHIPPED.glob("*.safetensors"))
 
 

@@ -12,8 +12,8 @@ constexpr double max_difference = 0.45;      // of the displacements of neighbou
 constexpr double inconsistency_cost = 0.75;  // of neighbours with a larger difference; 0.5 at this difference
 constexpr double extrapolation = 0.7;        // damping of the linear extrapolation
 constexpr double search_radius = 1.15;       // of the markers around a dot that the placement search tries
-constexpr double motion_weight = 0.5;        // cost of moving by one spacing, in lines; an unassigned marker costs 1
-constexpr double missing_line = 0.5;         // share of a line without dots that a wrong jump by one line may have left
+constexpr double motion_weight = 1.2;        // cost of moving by one spacing, in lines; an unassigned marker costs 1
+constexpr double missing_line = 0.5;         // share of a line that must newly be unassigned for a search
 constexpr int search_interval = 10;          // images between placement searches while a failure persists
 }  // namespace
 
@@ -168,7 +168,9 @@ void DotAssignment::grow() {
 DotAssignment::Score DotAssignment::evaluate() const {
   Score score;
   const double unit = 1 / (spacing_ * spacing_);
-  const double motion_cost = motion_weight * std::min(grid_.rows, grid_.cols) / grid_.size();
+  // A motion along the rows can hide the dots of a column, and costs more than this column if it is a spacing.
+  const double motion_cost = motion_weight * unit / grid_.size();
+  const double most = 2.0 * spacing_ * spacing_ * std::min(grid_.rows, grid_.cols);
   for (int m = 0; m < grid_.size(); ++m) {
     if (dot_of_[std::size_t(m)] < 0) {
       Point displacement{};
@@ -179,7 +181,9 @@ DotAssignment::Score DotAssignment::evaluate() const {
       continue;
     }
     const Point displacement = displacement_of(m);
-    score.cost += motion_cost * std::min(squared(displacement) * unit, 2.0);
+    score.cost +=
+        motion_cost *
+        std::min(grid_.rows * displacement.x * displacement.x + grid_.cols * displacement.y * displacement.y, most);
     for (int direction : {Grid::rightward, Grid::downward}) {  // each pair once
       const int other = grid_.neighbour(m, direction);
       if (!is_assigned(other)) continue;
@@ -280,7 +284,7 @@ const std::vector<int>& DotAssignment::assign(const std::vector<Dot>& dots, cons
     if (best_score_.unexplained() > 0 || misses_a_line(best_score_)) search_placements();
     images_since_search_ = 0;
   }
-  last_score_ = best_score_;
+  if (2 * best_score_.markers < grid_.size()) last_score_ = best_score_;  // an image without most dots is no reference
   dot_of_ = best_dot_of_;
   drop_inconsistent();
   return dot_of_;

@@ -7,8 +7,9 @@
 // weight, the mean motion.
 //
 // The first hypotheses start from the dots nearest to the predicted and to the last marker positions. They fail where
-// markers jump by more than half their spacing, and may then lack a line of markers only. Then a search assigns each of a few dots, spread over the image, to each
-// of the markers around it in turn, grows the whole grid from that pair, and keeps the hypothesis with the lowest cost.
+// markers jump by more than half their spacing; the only sign may be an outer line of markers or dots that is not
+// assigned. Then a search assigns each of a few dots, spread over the image, to each of the markers around it in turn,
+// grows the whole grid from that pair, and keeps the hypothesis with the lowest cost.
 // The order of operations is fixed; nothing is random.
 #pragma once
 
@@ -41,7 +42,7 @@ class DotAssignment {
     int markers = 0, dots = 0;  // markers with their centre in the image, and dots, that are not assigned
     int inconsistent = 0;       // pairs of neighbours with different displacements
     double cost = 0;
-    // From bridges and dust, if there are few; markers without a dot alone may be covered.
+    // Signs of a wrong hypothesis; bridges and dust cause a few. Covered markers alone are none.
     int unexplained() const { return std::min(markers, dots) + inconsistent; }
   };
 
@@ -72,7 +73,7 @@ class DotAssignment {
   std::vector<char> is_taken_, visible_;
   std::vector<Candidate> heap_;
   Score best_score_;
-  Score last_score_;             // of the last image
+  Score last_score_;             // of the last image that showed most of the grid
   int images_since_search_ = 0;  // since the last search over placements
   // Dots sorted into square cells of one spacing: cell_dots_[cell_begin_[c]] … cell_dots_[cell_begin_[c + 1] − 1].
   int cells_x_ = 0, cells_y_ = 0;

@@ -107,7 +107,7 @@ def actors(network: Network, task: TaskBatch, *, seed: int) -> dict[str, BatchPo
         noisy = NoisyPolicy(network.batch_policy(n), FlowMapNoise(), n, insertion.sensors, seed)
         found["policy, noisy flow maps"] = noisy
         reach = np.asarray(network.reach) / np.asarray(insertion.action_scale)
-        random = {"random, largest correction": RandomPolicy(n, reach, seed), **random}
+        random = {"random, up to the largest correction": RandomPolicy(n, reach, seed), **random}
     if has_oracle(task):
         found["oracle"] = OraclePolicy(task)
     return found | random

@@ -56,13 +56,12 @@ def execute_runs(runs: Sequence[Run], engine: Engine, *, tries: int, report: Rep
     Parameters
     ----------
     runs: those that are not complete
-    engine: executes them
+    engine: executes them; they have been submitted to it
     tries: starts of a run. No exit code excludes another start: a full disk has the same one as wrong input.
     report: called for each run that ended
     """
     tried = Counter({run.name: 1 for run in runs})
     remaining = len(runs)
-    engine.submit(runs)
     while remaining:
         for run, ended in engine.ended():
             record = ended if ended.exit_code is not None else _without_worker(run, ended.error)

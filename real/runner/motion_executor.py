@@ -10,8 +10,8 @@ from types import TracebackType
 import numpy as np
 
 from gelflow.clock import Clock, raise_priority
-from gelflow.errors import GelflowError, PeerError, PeerTimeout, SafetyError
-from gelflow.geometry import Pose, angle_between
+from gelflow.errors import GelflowError, PeerError, SafetyError
+from gelflow.geometry import Pose
 from gelflow.protocols import ArmState, Camera, Gripper, GripperState
 from gelflow.real.egm.cycle_log import EgmCycle
 from gelflow.real.egm.driver import EgmArm
@@ -20,19 +20,18 @@ from gelflow.real.limits import LIMITS
 from gelflow.real.runner.checks import DataChecks
 from gelflow.real.runner.lab import Lab
 from gelflow.real.runner.phases import with_advice
+from gelflow.real.runner.progress import ARRIVED, Progress
 from gelflow.real.runner.supervisor import Supervisor
 from gelflow.real.web_services.monitor import ControllerMonitor
+from gelflow.real.wsg.checks import may_hold_part
 from gelflow.session.recorder import SessionRecorder
 
 RECORD_EVERY = 5  # EGM cycles: poses are recorded at 50 Hz, and in addition at every change of a cycle's flags
 _HISTORY = 8192  # number of measured heights kept, one per cycle: 32 s
-ARRIVED = (0.1e-3, math.radians(0.1))  # distance from the target at which a move has ended [m, rad]
-_PROGRESS = 0.1  # reduction of the remaining motion that counts as progress, as a fraction of ARRIVED
 # Time without an observation of the pads after which a guarded motion holds [s]: 250 ms, less the longest wait of the
 # observer and tracking.
 LONGEST_UNOBSERVED = LIMITS.image_age - 0.03
 _WIDTH_CHANGE = 0.5e-3  # of the gripper since the grasp, above which the part has moved [m]
-_BLOCKED_AFTER = 3.0  # without progress [s]
 _WATCH_PERIOD = 0.004  # of the checks of all data, one cycle of EGM [s]
 _CHECKS_PERIOD = 0.5  # between two records of the checks [s]
 _LEAST_WAIT = 0.004  # between two checks, for clocks faster than real time [s, wall]
@@ -140,6 +139,8 @@ class MotionExecutor:
         try:
             with self._lock:  # so that no motion starts after `request_stop`
                 self._check_requested_stop()
+                if self._part_lost:
+                    raise PartLost(self._part_lost)
                 self._post(target, speeds)
                 self._goal, self._speeds = target, speeds
                 self._observe_until = self._clock.now() + LONGEST_UNOBSERVED if guarded else math.inf
@@ -152,19 +153,19 @@ class MotionExecutor:
         self._recorder.arm_command(stamp, tool.position, tool.quaternion, kind="command")
         self._recorder.event("move", {"speed": speeds[0], "turn_speed": speeds[1], "position": tool.position})
 
-    def observed(self) -> bool:
-        """The caller of a guarded motion has observed the pads just now.
+    def observed(self, age: float) -> bool:
+        """The caller of a guarded motion has observed both pads, in images of at most this age [s].
 
         Returns False when the arm holds because this took too long: `go` continues.
         """
         with self._lock:
-            self._observe_until = self._clock.now() + LONGEST_UNOBSERVED
+            self._observe_until = self._clock.now() + LIMITS.image_age - 0.01 - age
             return not self._unobserved
 
     def hold(self) -> None:
         """Give up the target and come to rest; see `EgmArm.hold`."""
         with self._lock:
-            self._goal = None
+            self._goal, self._unobserved = None, False
             self._arm.hold()
 
     def arrived(self, *, within: float = ARRIVED[0]) -> bool:
@@ -182,9 +183,9 @@ class MotionExecutor:
             progress.check()
             self.wait(0.02)
 
-    def progress(self, target: Pose) -> "Progress":
+    def progress(self, target: Pose) -> Progress:
         """Monitors from now on whether the arm comes closer to `target`."""
-        return Progress(self, target, self._clock)
+        return Progress(self.pose, self.hold, target, self._clock)
 
     def wait(self, seconds: float) -> None:
         """Wait for `seconds` of robot time. Raises the failure of the thread, or PartLost."""
@@ -220,7 +221,7 @@ class MotionExecutor:
     # Called from any thread
 
     def request_stop(self, reason: str) -> None:
-        """Stop the arm now, for the rest of the run: it holds before this call returns, then the run ends.
+        """Stop the arm, and fingers without a part, for the rest of the run: the arm holds before this call returns.
 
         For an operator's stop button, in addition to the robot's own. The next call of the runner raises SafetyError.
         """
@@ -343,7 +344,7 @@ class MotionExecutor:
             self._recorder.arm_command(record.stamp, record.applied[0], record.applied[1], kind="applied")
 
     def _fail(self, error: Exception) -> None:
-        """Hold within this cycle, then stop, the fingers too unless they hold a part: that stays held."""
+        """Hold within this cycle, then stop the arm, and the fingers unless they may hold a part, which stays held."""
         known = isinstance(error, GelflowError)
         self.failure = error if isinstance(error, GelflowError) else PeerError(f"{type(error).__name__}: {error}")
         reason = str(self.failure)
@@ -362,38 +363,11 @@ class MotionExecutor:
             self._recorder.event("stopped", {"reason": str(self.failure), "expected": known})
 
     def _stop_empty_fingers(self) -> None:
-        if not self._part_expected and self._gripper.state().grasp != "holding":
+        state = self._gripper.state()
+        at_rest = state.grasp not in ("grasping", "releasing", "positioning")
+        if not self._part_expected and not (at_rest and may_hold_part(state, grasped=False)):
             self._gripper.stop()
 
     def _raise_failure(self) -> None:
         if self.failure is not None:
             raise type(self.failure)(*self.failure.args) from self.failure
-
-
-class Progress:
-    """Monitors that the arm comes closer to a target.
-
-    The controller may follow more slowly than the reference may move (MaxSpeedDeviation), so the duration of a motion
-    does not show whether the arm is blocked.
-    """
-
-    def __init__(self, motion: MotionExecutor, target: Pose, clock: Clock) -> None:
-        self._motion, self._target, self._clock = motion, target, clock
-        self._best, self._since = math.inf, clock.now()
-
-    def check(self) -> None:
-        """Hold and raise PeerTimeout when the arm came no closer for 3 s [robot time]."""
-        now = self._clock.now()  # before the pose: a delay of this thread between the two is no lack of progress
-        pose = self._motion.pose()
-        distance = float(np.linalg.norm(pose.position - self._target.position)) / ARRIVED[0]
-        turn = angle_between(pose.quaternion, self._target.quaternion) / ARRIVED[1]
-        remaining = max(distance, turn)  # 1 at the arrival
-        if remaining < self._best - _PROGRESS:
-            self._best, self._since = remaining, now
-        elif now - self._since > _BLOCKED_AFTER:
-            self._motion.hold()
-            millimetres, degrees = 1e3 * distance * ARRIVED[0], math.degrees(turn * ARRIVED[1])
-            raise PeerTimeout(
-                f"the arm is {millimetres:.2f} mm and {degrees:.2f}° from its target and came no closer for "
-                f"{_BLOCKED_AFTER:g} s; is it blocked, or slower than its MaxSpeedDeviation?"
-            )

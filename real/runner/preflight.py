@@ -107,7 +107,7 @@ def _pose(cell: Cell, supervisor: Supervisor) -> str:
     pose = cell.lab.gripper_pose(state.position, state.quaternion)
     x, y, yaw, height = supervisor.hole_coordinates(pose)
     try:
-        supervisor.check(pose, pose, speed=1e-6, turn_speed=1e-6)
+        supervisor.check(supervisor.within_workspace(pose), pose, speed=1e-6, turn_speed=1e-6)
     except SafetyError as error:
         raise SafetyError(f"{error}; jog the gripper above the hole") from None
     turn = math.degrees(yaw)

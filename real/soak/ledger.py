@@ -36,9 +36,11 @@ class Ledger:
                 known = False
             if not known:
                 raise UsageError(f"{path}, line {number}, is not a row of a soak test; name another folder with --out")
+            if not settings.keys() <= row.keys():
+                raise UsageError(f"{path} is of an earlier gelflow: its plans have no settings; name another --out")
             for key, value in settings.items():
-                if row.get(key) != value:
-                    raise UsageError(f"{path} has plans with {key} {row.get(key)}, not {value}; name another --out")
+                if row[key] != value:
+                    raise UsageError(f"{path} has plans with --{key} {row[key]}, not {value}; name another --out")
         if lines and lines[-1]:
             self._cut(len(lines[-1]))
 

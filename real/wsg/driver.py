@@ -340,6 +340,7 @@ class WsgGripper:
     ) -> None:
         """Send a motion and wait for its result. On a failure, stops the fingers and raises PeerRefused."""
         link = self._connected()
+        stops = link.stops
         if not self._moving.acquire(blocking=False):
             raise SafetyError(f"{name} refused: another motion is in progress; stop it or wait")
         try:
@@ -350,7 +351,7 @@ class WsgGripper:
                 self._limit_force(link, force)
             self._grasped = self._grasped or packet.id == Command.GRASP
             try:
-                reply, pending = link.run(packet, timeout=timeout)
+                reply, pending = link.run(packet, timeout=timeout, stops=stops)
             except BaseException as error:
                 self._stop_after(name, f"{type(error).__name__}: {error}")
                 raise

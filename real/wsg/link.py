@@ -66,6 +66,7 @@ class WsgLink:
         self._ending = threading.Event()
         self._thread: threading.Thread | None = None
         self.corrupt = 0
+        self.stops = 0  # that were sent
 
     @property
     def address(self) -> str:
@@ -97,7 +98,7 @@ class WsgLink:
         `urgent` skips the pause between commands. Raises PeerTimeout, PeerRefused or PeerError.
         """
         with self._inbox(Command(packet.id)) as inbox:
-            self._send(packet, urgent=urgent)
+            self.send(packet, urgent=urgent)
             reply = self._take(inbox, packet, self._reply_timeout)
             if reply.status == Status.CMD_PENDING:  # some firmware first acknowledges a stop
                 reply = self._take(inbox, packet, self._reply_timeout)
@@ -106,18 +107,27 @@ class WsgLink:
             raise WsgRefused(text, status=reply.status)
         return reply
 
-    def send(self, packet: Packet) -> None:
-        """Send a command at once, without waiting for a reply. Raises PeerError when the transport is broken."""
-        self._write(packet)
+    def send(self, packet: Packet, *, urgent: bool = False, stops: int | None = None) -> None:
+        """Send a command without waiting for a reply, after the pause between commands unless it is `urgent`.
 
-    def run(self, packet: Packet, *, timeout: float) -> tuple[Reply, bool]:
+        Raises PeerError when the transport is broken, and PeerRefused when more than `stops` stops were sent.
+        """
+        if urgent:
+            self._write(packet)
+            return
+        with self._pacing:
+            self._clock.sleep(self._last_write + self._interval - self._clock.now())
+            self._write(packet, stops)
+
+    def run(self, packet: Packet, *, timeout: float, stops: int) -> tuple[Reply, bool]:
         """Send a motion and wait for its result; returns the final reply and whether the motion had started.
 
-        Raises PeerTimeout without a first reply within the reply time-out or a result within `timeout` [s].
+        `stops` is the number of stops when the motion was prepared. Raises PeerRefused when another one was sent since,
+        PeerTimeout without a first reply within the reply time-out or a result within `timeout` [s].
         """
         pending = False
         with self._inbox(Command(packet.id)) as inbox:
-            self._send(packet, urgent=False)
+            self.send(packet, stops=stops)
             deadline = self._clock.now() + timeout
             while True:
                 reply = self._take(inbox, packet, deadline - self._clock.now() if pending else self._reply_timeout)
@@ -129,18 +139,14 @@ class WsgLink:
                     return reply, pending
                 # A success before the motion is pending repeats the result of an earlier command.
 
-    def _send(self, packet: Packet, *, urgent: bool) -> None:
-        if urgent:
-            self.send(packet)
-            return
-        with self._pacing:
-            self._clock.sleep(self._last_write + self._interval - self._clock.now())
-            self._write(packet)
-
-    def _write(self, packet: Packet) -> None:
+    def _write(self, packet: Packet, stops: int | None = None) -> None:
         with self._writing:
             if self._broken:
                 raise self._failure_copy()
+            if packet.id in (Command.STOP, Command.FAST_STOP):
+                self.stops += 1
+            elif stops is not None and stops != self.stops:
+                raise PeerRefused(f"the gripper was stopped before {Command(packet.id).name} was sent")
             try:
                 self._transport.write(packet.encode(crc=self._crc))
             except PeerError as error:

@@ -118,7 +118,7 @@ def test_a_soak_test_with_other_settings_needs_another_folder(
     capsys.readouterr()
     assert main(["soak", "--plans", "2", "--out", str(tmp_path), *options]) == 2
     error = capsys.readouterr().err
-    assert f"has plans with {changed}; name another --out" in error and error.count("\n") == 1
+    assert f"has plans with --{changed}; name another --out" in error and error.count("\n") == 1
     assert cases == [0]
 
 

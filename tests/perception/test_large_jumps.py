@@ -45,6 +45,34 @@ def test_a_jump_that_moves_an_outer_line_out_of_the_image_exchanges_no_marker(
     assert tracked.valid.all()
 
 
+@pytest.mark.parametrize("side", [0, 1])
+@pytest.mark.parametrize("columns", [True, False])
+def test_a_covered_outer_line_exchanges_no_marker(columns: bool, side: int) -> None:
+    """Its dots, and a shift that moves the opposite line out of the image, would explain the image as well."""
+    rows, cols = 10, 13
+    rest = grid(rows, cols)
+    tracker = MarkerTracker()
+    tracker.start(draw(rest, rows, cols))
+    lines = np.arange(rows * cols).reshape(rows, cols)
+    covered = (lines[:, -side] if columns else lines[-side]).tolist()
+    for number in range(1, 13):
+        visible = np.delete(rest, covered if number > 1 else [], axis=0)
+        tracked = tracker.track(draw(visible, rows, cols, seed=number))
+        off = np.linalg.norm(tracked.position - rest, axis=1)
+        assert tracked.valid.sum() >= rows * cols - len(covered) and off[tracked.valid].max() < 1.0
+
+
+def test_a_jump_after_a_dark_image_exchanges_no_marker() -> None:
+    rest = grid(10, 13)
+    tracker = MarkerTracker()
+    tracker.start(draw(rest, 10, 13))
+    tracker.track(draw(rest[:0], 10, 13, seed=1))
+    truth = rest + np.array([0.8 * SPACING, 0.0])
+    tracked = tracker.track(draw(truth, 10, 13, seed=2))
+    off = np.linalg.norm(tracked.position - truth, axis=1)
+    assert tracked.valid.mean() > 0.9 and off[tracked.valid].max() < 1.0
+
+
 @pytest.mark.parametrize("shift", [0.7, 0.8, 0.9])
 def test_a_jump_of_a_grid_of_many_lines_exchanges_no_marker(shift: float) -> None:
     rest = grid(40, 40)

@@ -29,7 +29,7 @@ from gelflow.real.wsg.checks import holds_part, may_hold_part
 from gelflow.session.records import Decision
 from gelflow.task import InsertionTask
 
-_STATE_TIME = 0.2  # after a refused grasp, until the state of the gripper shows its result [s]
+_STATE_TIME = 0.2  # after a refused grasp or a lost part, until the state of the gripper shows its result [s]
 _LEVEL = 0.5e-3  # a gripper that is lower than the hand-over by less is not raised first [m]
 _HAND_OVER_TIME = 3.0  # after the grasp, for the operator to let the part go [s]
 
@@ -138,6 +138,8 @@ class InsertionRunner:
         A part that may still be between the fingers is raised while both pads are observed, then handed back; `part` is
         None at the hand-over. Raises PartLost when it moves again.
         """
+        self._motion.expect_part(False)  # the arm holds, and the fingers may still close
+        self._motion.wait(_STATE_TIME)
         state = self._cell.gripper.state()
         outcome = evidence if holds_part(state, grasped=True) else "part lost"
         if not may_hold_part(state, grasped=True):

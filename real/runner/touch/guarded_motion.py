@@ -11,8 +11,9 @@ from gelflow.clock import ScaledClock
 from gelflow.errors import PeerTimeout
 from gelflow.geometry import Pose
 from gelflow.real.runner.lab import Lab
-from gelflow.real.runner.motion_executor import ARRIVED, LONGEST_UNOBSERVED, MotionExecutor
+from gelflow.real.runner.motion_executor import LONGEST_UNOBSERVED, MotionExecutor
 from gelflow.real.runner.phases import Phase
+from gelflow.real.runner.progress import ARRIVED
 from gelflow.real.runner.touch.observer import TactileObserver, TactileReading
 from gelflow.session.recorder import SessionRecorder
 from gelflow.time_sync import RUNNER
@@ -137,7 +138,7 @@ class GuardedMotion:
                     self._wait_until_readable()
                     self._motion.go(target, speed=speed, guarded=True)
                     progress = self._motion.progress(target)
-                elif not self._motion.observed():  # this thread has stalled
+                elif not self._motion.observed(self.observer.blind_time()):  # this thread has stalled
                     self._motion.go(target, speed=speed, guarded=True)
                     progress = self._motion.progress(target)
                 progress.check()

@@ -104,7 +104,7 @@ def _recorded_perception(description: Mapping[str, Any]) -> tuple[InsertionTask,
 
 
 def _recorded_checkpoint(description: Mapping[str, Any]) -> Path:
-    """The checkpoint of the session, at its recorded path or shipped with gelflow."""
+    """The checkpoint of the session, at its recorded path or included in gelflow."""
     from gelflow.policies.checkpoint import shipped_checkpoints
 
     recorded = description.get("checkpoint")

@@ -25,7 +25,6 @@ from gelflow.session.reader import SessionReader, is_being_recorded, is_finished
 from gelflow.session.recorder import CHUNK_BYTES
 
 _HEAD = struct.Struct("<BQ")  # opcode and length of a record
-_OPCODES = frozenset(map(int, Opcode))
 
 
 @dataclass(frozen=True)
@@ -170,7 +169,7 @@ def _summary(stream: BinaryIO) -> Summary:
 
 
 def _chunk_starts(stream: BinaryIO, summary: Summary) -> list[int]:
-    """Positions of the chunks in the index of the file, in order; those that are not the start of a chunk excepted."""
+    """Positions of the chunks in the index of the file, in order, without entries that do not point to a chunk."""
     starts = []
     for index in summary.chunk_indexes:
         with contextlib.suppress(*READ_ERRORS):
@@ -193,7 +192,7 @@ def _complete_records(stream: BinaryIO, starts: list[int], copy: _Copy) -> Itera
         following = bisect_right(starts, position)
         limit = starts[following] if following < len(starts) else size
         end = position + _HEAD.size + length
-        if opcode not in _OPCODES or end > limit:
+        if opcode == 0 or end > limit:  # no record has opcode 0: zeros would be records of length 0
             copy.lost += limit - position
             position = limit
             continue

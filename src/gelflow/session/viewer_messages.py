@@ -11,7 +11,10 @@ from numpy.typing import NDArray
 from gelflow.session.records import to_plain
 
 ERRORS = ("stopped", "arm stopped", "part lost")
-WARNINGS = ("pad not readable", "reference repeated", "weight not shown", "camera latency", "forces ended")
+WARNINGS = (
+    *("pad not readable", "pads not observed", "reference repeated"),
+    *("weight not shown", "camera latency", "forces ended"),
+)
 
 
 def flow_image(flow: NDArray[np.float32], nanoseconds: int) -> RawImage:

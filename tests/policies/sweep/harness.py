@@ -56,7 +56,9 @@ def sweep(runs: Sequence[Run], engine: Callable[[], Engine], *, tries: int = 3) 
 
     folder = runs[0].folder
     with sweep_folder(folder), engine() as made:
-        execute_runs(incomplete(runs), made, tries=tries, report=report)
+        remaining = incomplete(runs)
+        made.submit(remaining)
+        execute_runs(remaining, made, tries=tries, report=report)
     return ended
 
 

@@ -190,7 +190,7 @@ class InterruptedGripper:
             thread = self.on_read.pop()
             thread.start()
             thread.join(0.5)
-        return SimpleNamespace(width=0.05, grasp=self.grasp, fault="")
+        return SimpleNamespace(width=0.05, force=12.0, grasp=self.grasp, fault="")
 
 
 class FakeArm:
@@ -231,14 +231,14 @@ def test_a_guarded_motion_holds_when_its_caller_no_longer_observes_the_pads() ->
     motion.go(Pose(np.array([0.0, 0.0, 0.1]), np.array([1.0, 0.0, 0.0, 0.0])), guarded=True)
     for clock.seconds in (0.2, 0.4, 0.6):
         motion._hold_unobserved(clock.seconds)
-        assert motion.observed() and arm.holds == 0
+        assert motion.observed(0.0) and arm.holds == 0
     clock.seconds = 0.9
     motion._hold_unobserved(clock.seconds)
-    assert arm.holds == 1 and not motion.observed()
+    assert arm.holds == 1 and not motion.observed(0.0)
     motion.go(Pose(np.array([0.0, 0.0, 0.1]), np.array([1.0, 0.0, 0.0, 0.0])), guarded=True)
-    assert motion.observed()
+    assert motion.observed(0.0)
     motion.hold()  # for another reason, such as a lost part: the motion does not continue
-    assert motion.observed()
+    assert motion.observed(0.0)
 
 
 @pytest.mark.parametrize("reported", ["part lost", "idle", "error"])

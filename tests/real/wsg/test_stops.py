@@ -19,13 +19,14 @@ from tests.real.wsg.harness import (
     wait_for_error,
 )
 
-from gelflow.errors import PeerError, PeerTimeout, SafetyError
+from gelflow.errors import PeerError, PeerRefused, PeerTimeout, SafetyError
 from gelflow.protocols import GripperState
 from gelflow.real.transport import transport_for
 from gelflow.real.wsg.codec import Packet
 from gelflow.real.wsg.config import WsgConfig
 from gelflow.real.wsg.constants import Command
 from gelflow.real.wsg.driver import WsgGripper
+from gelflow.real.wsg.link import WsgLink
 
 MOTION_IDS = {Command.HOME, Command.PRE_POSITION, Command.STOP, Command.FAST_STOP, Command.GRASP, Command.RELEASE}
 
@@ -58,6 +59,21 @@ def test_stop_from_another_thread_ends_a_motion_and_a_second_motion_is_refused()
         thread.join(PATIENT)
         assert len(errors) == 1 and "CMD_ABORTED" in str(errors[0])
         assert gripper.state().width > 0.09
+
+
+def test_a_stop_while_the_force_limit_is_set_prevents_the_grasp(monkeypatch: pytest.MonkeyPatch) -> None:
+    with connected() as (gripper, _, plant, _):
+        gripper.home()
+        limit_force = gripper._limit_force
+
+        def stopped(link: WsgLink, force: float) -> None:
+            limit_force(link, force)
+            gripper.stop()
+
+        monkeypatch.setattr(gripper, "_limit_force", stopped)
+        with pytest.raises(PeerRefused, match="the gripper was stopped before GRASP was sent"):
+            gripper.grasp(width=0.040, speed=0.4, force=20)
+        assert plant.gripper_state()[0] == pytest.approx(0.110) and gripper.state().grasp == "idle"
 
 
 def test_close_during_a_motion_stops_the_fingers() -> None:
@@ -93,7 +109,7 @@ def test_close_after_a_grasp_without_a_result_stops_the_fingers(monkeypatch: pyt
         link = gripper._link
         assert link is not None
 
-        def no_result(packet: Packet, *, timeout: float) -> None:
+        def no_result(packet: Packet, *, timeout: float, stops: int) -> None:
             link.send(packet)
             raise PeerTimeout("no result")
 

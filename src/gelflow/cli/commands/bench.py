@@ -71,10 +71,11 @@ def run(args: argparse.Namespace) -> int:
     output = Output(args.json, width=WIDTH)
     output.console.print(f"{processor()}. Medians of {repeats} repeats; the cases of a table run in turn.")
     reports: list[Report] = []
+    pictures: list[Callable[[Path], None]] = []  # each writes a file into the folder
     for name in list(dict.fromkeys(args.what)) or [name for name in MEASUREMENTS if name not in _LONG]:
         with _Bar() as bar:
             options = BenchmarkOptions(quick=quick, repeats=repeats, progress=bar)
-            measured = _measure(name, options, args)
+            measured = _measure(name, options, args, pictures)
         for report in measured:
             _show(output, report, markdown=args.markdown)
         reports += measured
@@ -85,6 +86,8 @@ def run(args: argparse.Namespace) -> int:
         file = args.out / "bench.json"
         file.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
         output.text(f"written: {file}")
+        for draw in pictures:
+            draw(args.out)
     return status
 
 
@@ -96,11 +99,14 @@ def conclude(reports: "Sequence[Report]", output: Output) -> int:
     return NEGATIVE_RESULT if violations else SUCCESS
 
 
-def _measure(name: str, options: "BenchmarkOptions", args: argparse.Namespace) -> "list[Report]":
+def _measure(
+    name: str, options: "BenchmarkOptions", args: argparse.Namespace, pictures: list[Callable[[Path], None]]
+) -> "list[Report]":
+    """Tables of a measurement; adds its pictures to `pictures`."""
     if name == "tracking":
-        return _measure_tracking(options, args.out)
+        return _measure_tracking(options, pictures, curves=args.out is not None)
     if name == "growth":
-        return [_measure_growth(options, args.out)]
+        return [_measure_growth(options, pictures)]
     if name == "startup":
         from gelflow.measurement.startup import measure_startup
 
@@ -110,27 +116,26 @@ def _measure(name: str, options: "BenchmarkOptions", args: argparse.Namespace) -
     return [measure(options, **more)]
 
 
-def _measure_growth(options: "BenchmarkOptions", folder: Path | None) -> "Report":
+def _measure_growth(options: "BenchmarkOptions", pictures: list[Callable[[Path], None]]) -> "Report":
     from gelflow.sim.benchmark.speed.growth import measure_growth
+    from gelflow.sim.benchmark.speed.growth_picture import draw
 
     report = measure_growth(options)
-    if folder is not None:
-        from gelflow.sim.benchmark.speed.growth_picture import draw
-
-        draw(report.results, folder / "growth.png")
+    pictures.append(lambda folder: draw(report.results, folder / "growth.png"))
     return report
 
 
-def _measure_tracking(options: "BenchmarkOptions", folder: Path | None) -> "list[Report]":
+def _measure_tracking(
+    options: "BenchmarkOptions", pictures: list[Callable[[Path], None]], *, curves: bool
+) -> "list[Report]":
+    from gelflow.perception.benchmark.curves import draw, measure_curves
     from gelflow.perception.benchmark.tracking import measure_tracking
 
     reports = measure_tracking(options)
-    if folder is not None:
-        from gelflow.perception.benchmark.curves import draw, measure_curves
-
-        curves = measure_curves(options)
-        draw(curves.results, folder / "tracking.png")
-        reports.append(curves)
+    if curves:
+        measured = measure_curves(options)
+        pictures.append(lambda folder: draw(measured.results, folder / "tracking.png"))
+        reports.append(measured)
     return reports
 
 

@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
     task = part_task(args.part)
     checkpoint = checkpoint_for(task, args.checkpoint)
     policy = load_policy(checkpoint, task=task)
-    _earlier_files(args.out)
+    _check_earlier_files(args.out)
     with live_page(args, output) as view:
         results = _run_all(output, args, policy, task, checkpoint, view)
     first = results[0]
@@ -311,10 +311,11 @@ def _to_json(session: Path, results: list[_SeriesResult], evaluations: "list[Eva
     }
 
 
-def _earlier_files(out: Path) -> list[Path]:
-    """The files of an earlier demo in the folder `out`, which is created if it does not exist.
+def _check_earlier_files(out: Path) -> list[Path]:
+    """Create the folder `out` if it does not exist; returns the files of an earlier demo in it.
 
-    Raises UsageError when it cannot be created, or files with these names are of something else or are being recorded.
+    Raises UsageError when the folder cannot be used, when files with these names are not of a demo, and when one is
+    being recorded.
     """
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -331,9 +332,9 @@ def _earlier_files(out: Path) -> list[Path]:
 
 
 def _clear(out: Path) -> None:
-    """Remove the files of an earlier demo. Raises UsageError as `_earlier_files`."""
+    """Remove the files of an earlier demo. Raises UsageError as `_check_earlier_files`."""
     try:
-        for path in _earlier_files(out):
+        for path in _check_earlier_files(out):
             path.unlink()
         (out / _MARKER).touch()
     except OSError as error:

@@ -215,4 +215,4 @@ def _show(output: Output, ledger: "Ledger") -> None:
         output.text(f"largest push: {max(pushes):.2f} mm, median {statistics.median(pushes):.2f} mm")
     if ledger.failing():
         seeds = " ".join(map(str, ledger.failing()))
-        output.text(f"failing seeds: {seeds}; run one again with: gelflow soak --only SEED")
+        output.text(f"failing seeds: {seeds}; run one again with the same options and --only SEED")

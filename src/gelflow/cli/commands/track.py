@@ -354,7 +354,7 @@ def _show(
     table = Table(show_header=False)
     table.add_row("images", str(values["images"]))
     if skipped.unreadable:
-        table.add_row("skipped", f"{skipped.unreadable} unreadable; {skipped.first}")
+        table.add_row("skipped", f"{skipped.unreadable} not readable or without a grid; {skipped.first}")
     if skipped.dropped:
         table.add_row("dropped", f"{skipped.dropped} live images, while tracking and writing were behind")
     table.add_row("markers", f"{markers}: {values['rows']} rows of {values['cols']}, {spacing:.1f} px apart")

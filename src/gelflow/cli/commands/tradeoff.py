@@ -44,10 +44,10 @@ def run(args: argparse.Namespace) -> int:
     from gelflow.sim.benchmark.tradeoff.picture import draw
     from gelflow.sim.benchmark.tradeoff.sweep import measure
 
-    if args.out is not None:
-        if args.out.suffix.lower() not in PICTURE_FORMATS:
-            raise UsageError(f"--out {args.out}: the suffix must be one of {', '.join(PICTURE_FORMATS)}")
-        create_folder(args.out.parent)
+    if args.out is not None and args.out.suffix.lower() not in PICTURE_FORMATS:
+        raise UsageError(f"--out {args.out}: the suffix must be one of {', '.join(PICTURE_FORMATS)}")
+    if args.out is not None or not args.json:
+        create_folder(args.out.parent if args.out is not None else Path("out"))
     output = Output(args.json)
     with progress_bar() as progress:
         task = progress.add_task("reference", total=1.0)

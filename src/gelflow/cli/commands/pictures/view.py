@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
 def _run_folder(name: str) -> str:
     """The name if it is that of a folder to show, else "".
 
-    A folder with the name of a included scene is shown only if it is a training or an evaluation.
+    A folder with the name of an included scene is shown only if it is a training or an evaluation.
     """
     folder = Path(name)
     if not name or not folder.is_dir():

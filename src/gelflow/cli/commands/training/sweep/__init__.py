@@ -64,10 +64,13 @@ def run(args: argparse.Namespace) -> int:
     runs = grid.runs(folder)
     with interruptible(), sweep_folder(folder):
         remaining = incomplete(runs)
-        store_grid_file(folder, args.grid)
         output.text(f"{len(runs)} runs in {folder}, {len(runs) - len(remaining)} of them complete")
-        if remaining:
+        if not remaining:
+            store_grid_file(folder, args.grid)
+        else:
             with progress_bar(count=True) as progress, _engine(args, grid, folder) as engine:
+                engine.submit(remaining)
+                store_grid_file(folder, args.grid)  # nothing was refused
                 view = _SweepProgress(progress, len(runs), len(remaining))
                 execute_runs(remaining, engine, tries=args.tries, report=view.report)
         return _finish(grid, runs, folder, output)
@@ -154,7 +157,8 @@ def _finish(grid: "Grid", runs: Sequence["Run"], folder: Path, output: Output) -
     failed = [run for run in runs if records[run.name].state != "complete"]
     output.console.print(summary_table(found, output.console))
     for run in failed:
-        output.text(f"failed: {run.name}: {records[run.name].error} (log: {run.log})")
+        log = f" (log: {run.log})" if run.log.exists() else ""
+        output.text(f"failed: {run.name}: {records[run.name].error}{log}")
     output.text(f"written: {', '.join(str(path) for path in files.values())}")
     output.result(
         {"folder": folder, "complete": len(runs) - len(failed), "failed": len(failed)}
