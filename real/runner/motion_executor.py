@@ -31,6 +31,7 @@ _HISTORY = 8192  # number of measured heights kept, one per cycle: 32 s
 # Time without an observation of the pads after which a guarded motion holds [s]: 250 ms, less the longest wait of the
 # observer and tracking.
 LONGEST_UNOBSERVED = LIMITS.image_age - 0.03
+_LEAST_UNOBSERVED = 0.05  # the same, with the oldest images that are readable in time [s]
 _WIDTH_CHANGE = 0.5e-3  # of the gripper since the grasp, above which the part has moved [m]
 _WATCH_PERIOD = 0.004  # of the checks of all data, one cycle of EGM [s]
 _CHECKS_PERIOD = 0.5  # between two records of the checks [s]
@@ -159,7 +160,7 @@ class MotionExecutor:
         Returns False when the arm holds because this took too long: `go` continues.
         """
         with self._lock:
-            self._observe_until = self._clock.now() + LIMITS.image_age - 0.01 - age
+            self._observe_until = self._clock.now() + max(_LEAST_UNOBSERVED, LIMITS.image_age - 0.01 - age)
             return not self._unobserved
 
     def hold(self) -> None:

@@ -138,9 +138,8 @@ class GuardedMotion:
                     self._wait_until_readable()
                     self._motion.go(target, speed=speed, guarded=True)
                     progress = self._motion.progress(target)
-                elif not self._motion.observed(self.observer.blind_time()):  # this thread has stalled
+                elif not self._motion.observed(self.observer.blind_time()):  # this thread was delayed
                     self._motion.go(target, speed=speed, guarded=True)
-                    progress = self._motion.progress(target)
                 progress.check()
                 self._check_deadline(deadline)
         return None
