@@ -251,6 +251,6 @@ def _is_image(path: Path) -> bool:
 
 
 def _check_pages(file: Path) -> None:
-    """Raise UsageError for a TIFF file with several pages, of which only the first would be read."""
+    """Raise UsageError for a TIFF file with several pages: OpenCV would read the first page only."""
     if file.suffix.lower() in (".tif", ".tiff") and (pages := cv2.imcount(str(file))) > 1:
         raise UsageError(f"{file} has {pages} pages; split it into a folder of images")

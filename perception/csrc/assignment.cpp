@@ -168,7 +168,7 @@ void DotAssignment::grow() {
 DotAssignment::Score DotAssignment::evaluate() const {
   Score score;
   const double unit = 1 / (spacing_ * spacing_);
-  // A motion along the rows can hide the dots of a column, and costs more than this column if it is a spacing.
+  // Moving by a spacing along the rows costs more than a column without dots: covered dots do not look like a motion.
   const double motion_cost = motion_weight * unit / grid_.size();
   const double most = 2.0 * spacing_ * spacing_ * std::min(grid_.rows, grid_.cols);
   for (int m = 0; m < grid_.size(); ++m) {

@@ -109,7 +109,7 @@ void Tracker::start(const std::uint8_t* bgr) {
       }
   if (responses.empty()) return;
   threshold_ = float(min_response_ratio) * median(std::move(responses));
-  detector_.detect(plane_, threshold_, 2 * setup_.rest.size() + 64, dots_);
+  std::erase_if(dots_, [this](const Dot& dot) { return !(dot.response > threshold_); });
   assignment_.assign(dots_, positions_, velocity_, setup_.visible);  // so that it knows what is usually not assigned
 }
 

@@ -34,6 +34,7 @@ _INTERVALS = 25  # between images, for the median frame interval: the first imag
 _SYNC_PERIOD = 50  # number of images between waits for the disk
 
 Floats = NDArray[np.float64]
+VIDEO_RATES = (0.01, 240.0)  # of video files [images/s]
 
 
 @dataclass(frozen=True)
@@ -225,11 +226,11 @@ def check_complete(path: Path, written: int) -> None:
 
 
 def video_rate(rate: float) -> float:
-    """The nearest rate [images/s] of 0.01 to 240 that video files can have.
+    """The nearest rate within `VIDEO_RATES` [images/s] that video files can have.
 
     MPEG-4 counts time in up to 65535 parts of a second, which OpenCV chooses by the decimals of the rate.
     """
-    return round(min(max(rate, 0.01), 240.0), 3 if rate < 60 else 2)
+    return round(min(max(rate, VIDEO_RATES[0]), VIDEO_RATES[1]), 3 if rate < 60 else 2)
 
 
 def overlay(step: TrackedImage, *, magnify: float, forces: bool) -> NDArray[np.uint8]:

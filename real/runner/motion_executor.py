@@ -23,15 +23,16 @@ from gelflow.real.runner.phases import with_advice
 from gelflow.real.runner.progress import ARRIVED, Progress
 from gelflow.real.runner.supervisor import Supervisor
 from gelflow.real.web_services.monitor import ControllerMonitor
-from gelflow.real.wsg.checks import may_hold_part
+from gelflow.real.wsg.checks import fingers_move, may_hold_part
 from gelflow.session.recorder import SessionRecorder
 
 RECORD_EVERY = 5  # EGM cycles: poses are recorded at 50 Hz, and in addition at every change of a cycle's flags
 _HISTORY = 8192  # number of measured heights kept, one per cycle: 32 s
-# Time without an observation of the pads after which a guarded motion holds [s]: 250 ms, less the longest wait of the
-# observer and tracking.
+# Age of the newest readable image at which a guarded motion holds [s]: 250 ms, less the longest wait of the observer
+# and tracking.
 LONGEST_UNOBSERVED = LIMITS.image_age - 0.03
-_LEAST_UNOBSERVED = 0.05  # the same, with the oldest images that are readable in time [s]
+_HOLD_TIME = 0.01  # from the end of the time for an observation to the hold, at most [s]
+_LEAST_TIME = 0.05  # for the next observation, however old the images are [s]
 _WIDTH_CHANGE = 0.5e-3  # of the gripper since the grasp, above which the part has moved [m]
 _WATCH_PERIOD = 0.004  # of the checks of all data, one cycle of EGM [s]
 _CHECKS_PERIOD = 0.5  # between two records of the checks [s]
@@ -160,7 +161,7 @@ class MotionExecutor:
         Returns False when the arm holds because this took too long: `go` continues.
         """
         with self._lock:
-            self._observe_until = self._clock.now() + max(_LEAST_UNOBSERVED, LIMITS.image_age - 0.01 - age)
+            self._observe_until = self._clock.now() + max(_LEAST_TIME, LIMITS.image_age - _HOLD_TIME - age)
             return not self._unobserved
 
     def hold(self) -> None:
@@ -274,13 +275,13 @@ class MotionExecutor:
         self.watch_part()
 
     def _hold_unobserved(self, now: float) -> None:
-        """Hold when the caller of a guarded motion has not observed the pads in time: its thread has stalled."""
+        """Hold when the caller of a guarded motion has not observed the pads in time: its thread is delayed."""
         with self._lock:  # together with the test, so that no `go` comes in between
             if self._goal is None or now <= self._observe_until or self.arrived():
                 return
             self._unobserved, self._goal = True, None
             self._arm.hold()
-        self._recorder.event("pads not observed", {"seconds": LONGEST_UNOBSERVED})
+        self._recorder.event("pads not observed", {})
 
     def _check_requested_stop(self) -> None:
         if self._requested_stop:
@@ -365,8 +366,7 @@ class MotionExecutor:
 
     def _stop_empty_fingers(self) -> None:
         state = self._gripper.state()
-        at_rest = state.grasp not in ("grasping", "releasing", "positioning")
-        if not self._part_expected and not (at_rest and may_hold_part(state, grasped=False)):
+        if not self._part_expected and (fingers_move(state) or not may_hold_part(state, grasped=False)):
             self._gripper.stop()
 
     def _raise_failure(self) -> None:

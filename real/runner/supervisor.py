@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import SafetyError
-from gelflow.geometry import Pose, angle_between, yaw_quaternion
+from gelflow.geometry import Pose, angle_between, multiply, yaw_quaternion
 from gelflow.protocols import ArmState
 from gelflow.real.runner.lab import Lab
 from gelflow.real.runner.phases import Phase, PhaseMachine, with_advice
@@ -79,15 +79,16 @@ class Supervisor:
     def within_workspace(self, measured: Pose) -> Pose:
         """A measured pose at a limit of x, y or yaw, moved back by at most 0.1 mm and 0.1°.
 
-        A motion straight up from a target at the limit is not refused because of what the arm deviates from it.
+        With it, a motion straight up from a target at the limit is not refused because the arm deviates slightly from
+        the target.
         """
         local, space = self._base_to_hole @ measured, self._lab.workspace
         now = np.array([*local.position[:2], local.yaw])
         limit = np.array([space.x, space.y, math.radians(space.yaw_deg)])
         back = np.clip(now, -limit, limit) - now
         back[np.abs(back) > _DEVIATION] = 0.0
-        turned = Pose(np.zeros(3), yaw_quaternion(back[2])) @ Pose(np.zeros(3), local.quaternion)
-        return self._lab.hole.pose @ Pose(local.position + np.append(back[:2], 0.0), turned.quaternion)
+        quaternion = np.array(multiply(yaw_quaternion(back[2]), local.quaternion))
+        return self._lab.hole.pose @ Pose(local.position + np.append(back[:2], 0.0), quaternion)
 
     @staticmethod
     def _check_numbers(target: Pose) -> None:

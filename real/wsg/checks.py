@@ -60,6 +60,11 @@ def holds_part(state: GripperState, *, grasped: bool) -> bool:
     return state.grasp == "holding" or (grasped and state.grasp not in ("part lost", "no part"))
 
 
+def fingers_move(state: GripperState) -> bool:
+    """Whether the fingers move, by the grasp state."""
+    return state.grasp in ("grasping", "releasing", "positioning")
+
+
 def may_hold_part(state: GripperState, *, grasped: bool) -> bool:
     """Whether a part cannot be excluded: as `holds_part`, or the fingers are grasping or press on something."""
     return holds_part(state, grasped=grasped) or state.grasp == "grasping" or state.force > _CLAMPING_FORCE

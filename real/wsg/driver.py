@@ -23,6 +23,7 @@ from gelflow.real.wsg.checks import (
     check_limits,
     check_opens,
     check_ready,
+    fingers_move,
     holds_part,
     may_hold_part,
 )
@@ -35,7 +36,6 @@ from gelflow.real.wsg.state import StateAssembler
 _log = logging.getLogger(__name__)
 _log.addHandler(logging.NullHandler())  # silent unless the program configures logging
 _WSG_50 = 1  # device type
-_IN_MOTION = ("grasping", "releasing", "positioning")  # grasp states while the fingers move
 _FORCE_TOLERANCE = 0.5  # between the requested and the confirmed force limit [N]
 
 _MEANING = {
@@ -143,7 +143,7 @@ class WsgGripper:
         _log.info("disconnecting from the gripper at %s: %s", link.address, reason)
         with self._changed:
             state = self._values.state(corrupt=False) if self._values.complete else None
-        held = state is not None and self._holds(state) and state.grasp not in _IN_MOTION
+        held = state is not None and self._holds(state) and not fingers_move(state)
         try:
             commands = [("disconnect", Command.DISCONNECT)]
             if (self._moving.locked() or not held) and not self._config.dry_run:

@@ -32,8 +32,9 @@ def make_estimator(settings: dict[str, Any]) -> ImageForces:
 
 def estimate(estimator: ImageForces, request: dict[str, Any]) -> dict[str, Any] | None:
     """The record of the forces in one image, as plain data; None if too few markers are valid."""
-    if request["reset"]:
+    if "angle" in request:  # the first request after a new rest
         estimator.reset()
+        estimator.angle = request["angle"]
     displacement, valid = np.array(request["displacement_mm"], dtype=float), np.array(request["valid"], dtype=bool)
     force = estimator.estimate(displacement, valid, request["stamp"])
     return None if force is None else dict(to_plain(force_record(force, estimator.slip)))

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from gelflow.errors import GelflowError
 from gelflow.gel.gel_file import ElasticGel
 from gelflow.helper_process import HelperProcess
-from gelflow.perception.force.image_forces import GridAxes, GridScale, record_in_image
+from gelflow.perception.force.image_forces import GridScale, grid_angle
 from gelflow.perception.frames import CameraMount
 from gelflow.perception.tracker import TrackingResult
 from gelflow.protocols import CameraImage
@@ -121,9 +121,11 @@ class PadForces:
         try:
             while waiting := self._take():
                 for sensor, tracked in waiting.items():
-                    reset = used.get(sensor) is not tracked.rest
-                    used[sensor] = tracked.rest
-                    self._estimate(sensor, tracked, reset=reset)
+                    begin: dict[str, Any] = {}
+                    if used.get(sensor) is not tracked.rest:
+                        used[sensor] = tracked.rest
+                        begin = {"angle": _angle(tracked.rest, self._mounts[sensor])}
+                    self._estimate(sensor, tracked, begin)
         except (OSError, ValueError, GelflowError) as error:  # ValueError: this side has closed the link
             self._end(str(error))
 
@@ -135,18 +137,17 @@ class PadForces:
             waiting, self._newest = self._newest, {}
             return {} if self._ended else waiting
 
-    def _estimate(self, sensor: int, tracked: _Tracked, *, reset: bool) -> None:
-        axes = _axes(tracked, self._mounts[sensor])
-        request = _request(tracked, self._mounts[sensor], axes)
-        self._helper.messages.send(request | {"sensor": sensor, "reset": reset})
+    def _estimate(self, sensor: int, tracked: _Tracked, begin: dict[str, Any]) -> None:
+        """Estimate and record; `begin` is part of the first request after a new rest, and otherwise empty."""
+        request = _request(tracked, self._mounts[sensor])
+        self._helper.messages.send(request | {"sensor": sensor} | begin)
         answers = self._helper.messages.wait()
         if not answers:
             raise ConnectionError(self._helper.exit_reason())
-        record = None if answers[0] is None else record_in_image(answers[0], axes)
-        if record is not None:
-            self._recorder.force(sensor, tracked.image.stamp, record)
+        if answers[0] is not None:
+            self._recorder.force(sensor, tracked.image.stamp, answers[0])
         with self._changed:
-            self._known.append((sensor, tracked.image.sequence, record))
+            self._known.append((sensor, tracked.image.sequence, answers[0]))
             self._changed.notify_all()
 
     def _end(self, reason: str) -> None:
@@ -179,17 +180,15 @@ def _scale(mount: CameraMount) -> GridScale:
     return GridScale(mount.pitch, mount.pixels_per_mm)
 
 
-def _axes(tracked: _Tracked, mount: CameraMount) -> GridAxes:
-    """The axes of the grid relative to those of the displacements, which a calibration aligns with the grid."""
-    if mount.calibration is not None:
-        return GridAxes()
-    return GridAxes.of(tracked.rest.position, *mount.image_grid)
+def _angle(rest: RestingPad, mount: CameraMount) -> float:
+    """Rotation of the grid from the axes of the displacements, which a calibration aligns with the grid [rad]."""
+    return 0.0 if mount.calibration is not None else grid_angle(rest.position, *mount.image_grid)
 
 
-def _request(tracked: _Tracked, mount: CameraMount, axes: GridAxes) -> dict[str, Any]:
-    """A request: displacements from the unloaded pad along `axes` [mm], shape (markers, 2), and validity."""
+def _request(tracked: _Tracked, mount: CameraMount) -> dict[str, Any]:
+    """A request: displacements (right, down) [mm] from the unloaded pad, shape (markers, 2), and validity."""
     displacement = tracked.result.position - tracked.rest.position
-    moved = axes.to_grid(mount.displacement_mm(replace(tracked.result, displacement=displacement)))
+    moved = mount.displacement_mm(replace(tracked.result, displacement=displacement))
     valid = tracked.result.valid & tracked.rest.valid
     return {
         "stamp": tracked.image.stamp,

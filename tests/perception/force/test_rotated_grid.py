@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from gelflow.gel.gel_file import ElasticGel
 from gelflow.observation import Grid
 from gelflow.perception.force.estimator import ForceEstimate
-from gelflow.perception.force.image_forces import GridAxes, GridScale, ImageForces
+from gelflow.perception.force.image_forces import GridScale, ImageForces, grid_angle
 from gelflow.perception.frames import CameraMount
 from gelflow.perception.synthetic.pressed_layer import Press, PressedLayer
 from gelflow.perception.tracker import TrackingResult
@@ -47,14 +47,14 @@ def upright(moved: NDArray[np.float64]) -> ForceEstimate:
 
 
 def test_the_axes_of_a_grid_follow_from_its_rest_positions() -> None:
-    assert GridAxes.of(REST, 10, 13).angle == pytest.approx(0.0, abs=1e-12)
-    assert GridAxes.of(rotated(REST), 10, 13).angle == pytest.approx(ANGLE)
+    assert grid_angle(REST, 10, 13) == pytest.approx(0.0, abs=1e-12)
+    assert grid_angle(rotated(REST), 10, 13) == pytest.approx(ANGLE)
     stretched = REST * [1.0, 1.1]
-    assert GridAxes.of(rotated(stretched), 10, 13).angle == pytest.approx(ANGLE)
+    assert grid_angle(rotated(stretched), 10, 13) == pytest.approx(ANGLE)
 
 
 def test_a_rotated_grid_has_the_forces_of_the_upright_one(moved: NDArray[np.float64], upright: ForceEstimate) -> None:
-    forces = ImageForces(GEL, 10, 13, GridScale(1.5, SCALE), GridAxes.of(rotated(REST), 10, 13))
+    forces = ImageForces(GEL, 10, 13, GridScale(1.5, SCALE), grid_angle(rotated(REST), 10, 13))
     found = forces.estimate(rotated(moved), VALID, 0.0)
     assert found is not None and found.centre_of_pressure is not None and upright.centre_of_pressure is not None
     assert found.normal == pytest.approx(upright.normal, rel=1e-6)

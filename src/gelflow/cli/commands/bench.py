@@ -118,21 +118,27 @@ def _measure(
 
 def _measure_growth(options: "BenchmarkOptions", pictures: list[Callable[[Path], None]]) -> "Report":
     from gelflow.sim.benchmark.speed.growth import measure_growth
-    from gelflow.sim.benchmark.speed.growth_picture import draw
 
     report = measure_growth(options)
-    pictures.append(lambda folder: draw(report.results, folder / "growth.png"))
+
+    def write(folder: Path) -> None:
+        from gelflow.sim.benchmark.speed.growth_picture import draw
+
+        draw(report.results, folder / "growth.png")
+
+    pictures.append(write)
     return report
 
 
 def _measure_tracking(
     options: "BenchmarkOptions", pictures: list[Callable[[Path], None]], *, curves: bool
 ) -> "list[Report]":
-    from gelflow.perception.benchmark.curves import draw, measure_curves
     from gelflow.perception.benchmark.tracking import measure_tracking
 
     reports = measure_tracking(options)
     if curves:
+        from gelflow.perception.benchmark.curves import draw, measure_curves
+
         measured = measure_curves(options)
         pictures.append(lambda folder: draw(measured.results, folder / "tracking.png"))
         reports.append(measured)

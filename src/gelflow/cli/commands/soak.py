@@ -19,24 +19,25 @@ if TYPE_CHECKING:
     from gelflow.real.soak.ledger import Ledger
 
 _FAILED_STARTS = 3  # of the mock robot, in sequence, after which the soak test ends
-_PLANS_ONLY = {"plans": 20, "factor": 2.0, "jitter": 0.1, "jobs": 1, "seed": 0, "preset": None}  # with defaults
+# Options of random plans only, and their defaults.
+_PLANS_ONLY: dict[str, Any] = {"plans": 20, "factor": 2.0, "jitter": 0.1, "jobs": 1, "seed": 0, "preset": None}
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
-    parser.add_argument("--plans", type=int, default=20, metavar="N", help="number of plans (default %(default)s)")
+    parser.set_defaults(**_PLANS_ONLY)
+    parser.add_argument("--plans", type=int, metavar="N", help="number of plans (default %(default)s)")
     parser.add_argument("--promises", action="store_true", help="measure bounds on the runner's reactions instead")
     parser.add_argument("--egm", type=float, metavar="MINUTES", help="run EGM, cameras, tracking and recording instead")
     parser.add_argument("--only", metavar="WHICH", help="the plan of this seed alone, or this promise alone")
-    parser.add_argument("--factor", type=float, default=2.0, metavar="X", help="robot time over wall time (default 2)")
+    parser.add_argument("--factor", type=float, metavar="X", help="robot time over wall time (default 2)")
     parser.add_argument(
         "--jitter",
         type=float,
-        default=0.1,
         metavar="S",
         help="added to a robot's time limits, for a computer with load (default %(default)s s)",
     )
-    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="plans at the same time (default 1)")
+    parser.add_argument("--jobs", type=int, metavar="N", help="plans at the same time (default 1)")
     add_seed(parser)
     add_preset(parser)
     add_out(parser, "folder of the results, continued if it exists", default=Path("out/soak"), folder=True)

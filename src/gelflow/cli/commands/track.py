@@ -15,13 +15,12 @@ from rich.table import Table
 
 from gelflow.cli import options
 from gelflow.cli.exit_codes import SUCCESS
-from gelflow.cli.options import add_json, add_page_address, add_profile, check_at_least, check_new_file, delete_empty
 from gelflow.cli.output import Output, progress_bar
 from gelflow.errors import UsageError
 from gelflow.gel.gel_file import ElasticGel, load_gel
 from gelflow.perception.camera_calibration import CameraCalibration, load_calibration
 from gelflow.perception.errors import TrackerInitError
-from gelflow.perception.force.image_forces import GridAxes, GridScale, ImageForces
+from gelflow.perception.force.image_forces import GridScale, ImageForces, grid_angle
 from gelflow.perception.force.recorded_pad import RecordedPad, recorded_pad
 from gelflow.perception.grid_detection.grid_part import Polarity
 from gelflow.perception.mount_check import VisiblePart, check_calibrated_scale, find_visible_part, lines_text
@@ -53,7 +52,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     polarity = parser.add_mutually_exclusive_group()
     polarity.add_argument("--dark", action="store_true", help="dots are darker than the gel (default: detected)")
     polarity.add_argument("--bright", action="store_true", help="dots are brighter than the gel (default: detected)")
-    add_profile(parser)
+    options.add_profile(parser)
     scale = parser.add_mutually_exclusive_group()
     scale.add_argument(
         "--calibration", type=Path, metavar="FILE", help="result of gelflow calibrate-camera: adds millimetres"
@@ -87,8 +86,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--show", action="store_true", help="show markers and forces in the browser, with a key for a new zero"
     )
-    add_page_address(parser, of=" of --show")
-    add_json(parser)
+    options.add_page_address(parser, of=" of --show")
+    options.add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -119,7 +118,7 @@ def run(args: argparse.Namespace) -> int:
         summary.complete = True
     finally:
         # An error or Ctrl-C keeps the results of the images before it.
-        files = delete_empty(args.out)
+        files = options.delete_empty(args.out)
         if summary.images:
             seconds, name = time.perf_counter() - begin, None if gel is None else gel.text
             _show(output, summary, source.skipped, seconds, files, name)
@@ -127,7 +126,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check(args: argparse.Namespace) -> None:
-    check_at_least(args, images=1)
+    options.check_at_least(args, images=1)
     options.check_page_address(args, "show")
     if args.pixels_per_mm is not None and not 0 < args.pixels_per_mm < float("inf"):
         raise UsageError(f"--pixels-per-mm must be above 0, got {args.pixels_per_mm:g}")
@@ -135,7 +134,7 @@ def _check(args: argparse.Namespace) -> None:
         raise UsageError(f"--magnify must be above 0, got {args.magnify}")
     for number, file in enumerate(args.out):
         check_suffix(file)
-        check_new_file(file)
+        options.check_new_file(file)
         if file.resolve() in (other.resolve() for other in args.out[:number]):
             raise UsageError(f"--out names {file} twice")
 
@@ -292,12 +291,12 @@ def _forces(
     if args.gel is None:
         return None
     if calibration is not None:
-        grid, axes = GridScale(calibration.spacing_mm, first.spacing / calibration.spacing_mm), None
+        grid, angle = GridScale(calibration.spacing_mm, first.spacing / calibration.spacing_mm), 0.0
     elif scale is not None:
-        grid, axes = GridScale(first.spacing / scale, scale), GridAxes.of(first.position, first.rows, first.cols)
+        grid, angle = GridScale(first.spacing / scale, scale), grid_angle(first.position, first.rows, first.cols)
     else:
         raise UsageError("--gel needs millimetres: give --calibration, --pixels-per-mm or a --profile with a pitch")
-    return ImageForces(args.gel, first.rows, first.cols, grid, axes)
+    return ImageForces(args.gel, first.rows, first.cols, grid, angle)
 
 
 def _writers(
@@ -354,7 +353,7 @@ def _show(
     table = Table(show_header=False)
     table.add_row("images", str(values["images"]))
     if skipped.unreadable:
-        table.add_row("skipped", f"{skipped.unreadable} not readable or without a grid; {skipped.first}")
+        table.add_row("skipped", f"{skipped.unreadable} unreadable or without a grid; {skipped.first}")
     if skipped.dropped:
         table.add_row("dropped", f"{skipped.dropped} live images, while tracking and writing were behind")
     table.add_row("markers", f"{markers}: {values['rows']} rows of {values['cols']}, {spacing:.1f} px apart")

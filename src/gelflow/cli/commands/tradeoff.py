@@ -46,8 +46,10 @@ def run(args: argparse.Namespace) -> int:
 
     if args.out is not None and args.out.suffix.lower() not in PICTURE_FORMATS:
         raise UsageError(f"--out {args.out}: the suffix must be one of {', '.join(PICTURE_FORMATS)}")
-    if args.out is not None or not args.json:
-        create_folder(args.out.parent if args.out is not None else Path("out"))
+    folder = Path("out") if args.out is None else args.out.parent
+    drawn = args.out is not None or not args.json
+    if drawn:
+        create_folder(folder)
     output = Output(args.json)
     with progress_bar() as progress:
         task = progress.add_task("reference", total=1.0)
@@ -57,12 +59,12 @@ def run(args: argparse.Namespace) -> int:
             repeats=repeats,
             done=lambda what, share: progress.update(task, description=what, completed=share),
         )
-    picture = args.out or (None if output.json else Path("out") / f"tradeoff_{measured.scene}.png")
     if output.json:
         output.result(dataclasses.asdict(measured) | {"processor": processor()})
     else:
         show(measured, f"{measured.scene}, one thread of {processor()}", output)
-    if picture is not None:
+    if drawn:
+        picture = args.out or folder / f"tradeoff_{measured.scene}.png"
         draw(measured, picture)
         output.text(f"picture: {picture}")
     return SUCCESS

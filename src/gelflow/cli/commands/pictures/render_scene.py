@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 
 _FILM_SECONDS = 2.0
 _MAX_FRAMES = 100_000
-_RATES = (0.01, 240.0)  # that a film can have, see `video_rate` [pictures/s]
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -54,8 +53,10 @@ def run(args: argparse.Namespace) -> int:
     suffix, size = args.out.suffix.lower(), picture_size(args.size)
     if suffix not in (*PICTURE_SUFFIXES, *VIDEO_CODECS):
         raise UsageError(f"--out must end in {', '.join((*PICTURE_SUFFIXES, *VIDEO_CODECS))}; got {args.out}")
-    if not _RATES[0] <= args.fps <= _RATES[1]:
-        raise UsageError(f"--fps must be within {_RATES[0]:g} to {_RATES[1]:g}, got {args.fps:g}")
+    from gelflow.perception.output.writers import VIDEO_RATES
+
+    if not VIDEO_RATES[0] <= args.fps <= VIDEO_RATES[1]:
+        raise UsageError(f"--fps must be within {VIDEO_RATES[0]:g} to {VIDEO_RATES[1]:g}, got {args.fps:g}")
     if not (np.isfinite(args.speed) and args.speed > 0):
         raise UsageError(f"--speed must be above 0, got {args.speed:g}")
     if not args.out.parent.is_dir():
