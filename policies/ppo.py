@@ -175,8 +175,11 @@ class PPO(Learner):
         return rate
 
     def _value_after_truncation(self) -> Tensor:
-        """Values (N,) of the last observations: a truncated episode would have continued, other ends have value 0."""
-        continues = self.task.truncated & ~self.task.info["failed"]
+        """Values (N,) of the last observations where an episode would have continued, 0 where its task ended it.
+
+        An episode whose simulation failed is truncated too: the value 0 would reward it where rewards are negative.
+        """
+        continues = self.task.truncated
         if not continues.any():
             return torch.zeros(self.task.num_envs)
         values: Tensor = self._critic(self._critic_inputs(), self._critic_memory)[0][:, 0]

@@ -8,6 +8,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from gelflow.errors import UsageError
 
+MAX_INTEGER = 2**31 - 1  # of the core
+
 
 def checked(function: Callable[..., Any], *arguments: Any) -> Any:
     """The result of a function of the core, whose ValueError and TypeError become a UsageError."""
@@ -41,11 +43,13 @@ def check_optional(**named: tuple[Any, type[Any]]) -> None:
 
 
 def integers(name: str, values: ArrayLike) -> NDArray[np.int32]:
-    """A sequence of integers."""
-    array: NDArray[np.int32] = number_array(name, values, np.int32)
+    """A sequence of integers of 32 bits."""
+    array = number_array(name, values, np.int64)
     if array.ndim != 1 or (array.size and not np.issubdtype(np.asarray(values).dtype, np.integer)):
         raise UsageError(f"{name} must be a sequence of integers, got {shown(values)}")
-    return array
+    if wrong := array[(array < -MAX_INTEGER) | (array > MAX_INTEGER)].tolist():
+        raise UsageError(f"{name} must be at most {MAX_INTEGER}, got {wrong[0]}")
+    return array.astype(np.int32)
 
 
 def flag(name: str, value: Any) -> bool:
@@ -60,6 +64,8 @@ def integer(name: str, value: Any, *, minimum: int | None = None) -> int:
         raise UsageError(f"{name} must be an integer, got {shown(value)}")
     if minimum is not None and value < minimum:
         raise UsageError(f"{name} must be at least {minimum}, got {value}")
+    if value > MAX_INTEGER:
+        raise UsageError(f"{name} must be at most {MAX_INTEGER}, got {value}")
     return int(value)
 
 

@@ -41,6 +41,7 @@ class TactileReduction:
         matrix = number_array("matrix", self.matrix, float)
         if matrix.ndim != 3 or matrix.shape[2] != 3 or not np.isfinite(matrix).all():
             raise UsageError(f"matrix must be finite, of shape (rows, markers, 3), got {matrix.shape}")
+        check_type("names", self.names, Sequence, "the names of the rows")
         if len(self.names) != len(matrix):
             raise UsageError(f"expected {len(matrix)} names of rows, got {len(self.names)}")
         object.__setattr__(self, "matrix", matrix)

@@ -80,7 +80,7 @@ class Simulator(StateArrays):
         self.model = scene if isinstance(scene, _core.Model) else scene.build()
         self.dtype: type[Any] = np.float64 if precision == "double" else np.float32
         batch = _core.Batch if precision == "double" else _core.BatchFloat
-        self._batch = batch(self.model, num_envs, min(num_envs, most))
+        self._batch = checked(batch, self.model, num_envs, min(num_envs, most))
         self.num_envs = num_envs
         self._threads = threads
         self.q: NDArray[Any] = self._batch.q

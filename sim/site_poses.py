@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gelflow.errors import UsageError
 from gelflow.sim import _core
-from gelflow.sim.arguments import number_array
+from gelflow.sim.arguments import checked, number_array
 
 Floats = NDArray[np.float64]
 
@@ -15,7 +15,7 @@ Floats = NDArray[np.float64]
 def site_poses(scene: Any, model: _core.Model, params: NDArray[Any], q: ArrayLike) -> Floats:
     """Poses (…, N, sites, 7) at positions q (…, N, nq) with the parameters (N, parameters) of each environment."""
     sites, rows = _sites(scene), _rows(model, params, q)
-    poses = _core.site_poses(model, sites, np.asarray(params, dtype=float), rows)
+    poses: Floats = checked(_core.site_poses, model, sites, np.asarray(params, dtype=float), rows)
     return poses.reshape(*np.shape(q)[:-1], len(sites), 7)
 
 
@@ -23,7 +23,7 @@ def site_poses_vjp(scene: Any, model: _core.Model, params: NDArray[Any], q: Arra
     """Gradient with respect to q, like q, from that with respect to the poses; for quaternions the tangent gradient."""
     sites, rows = _sites(scene), _rows(model, params, q)
     grad_rows = np.ascontiguousarray(grad_poses, dtype=float).reshape(len(rows), len(sites), 7)
-    grad_q = _core.site_poses_vjp(model, sites, np.asarray(params, dtype=float), rows, grad_rows)
+    grad_q: Floats = checked(_core.site_poses_vjp, model, sites, np.asarray(params, dtype=float), rows, grad_rows)
     return grad_q.reshape(np.shape(q))
 
 

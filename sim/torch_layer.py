@@ -2,7 +2,8 @@
 
 Tensors are on the CPU and have the simulator's precision. The state is an explicit argument; the simulator's own state
 is not changed. The gradient of a quaternion is its tangent gradient, mapped to four components. Physical parameters can
-be passed by name as tensors; their gradient is computed only when a tensor requires it.
+be passed by name as tensors; their gradient is computed only when a tensor requires it. Derivatives are first ones, by
+`backward` and `torch.autograd.grad`; `torch.func` and batched gradients are not supported.
 
 Paper: Xu et al., Efficient Tactile Simulation with Differentiability for Robotic Manipulation, CoRL 2022.
 """
@@ -25,7 +26,7 @@ from gelflow.sim.site_poses import site_poses, site_poses_vjp
 from gelflow.sim.trajectory import TouchStop, Trajectory
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TorchState:
     """State of all environments; see the attributes of `Simulator`."""
 
@@ -42,7 +43,7 @@ class TorchState:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TorchRollout:
     """Result of `torch_rollout`.
 
@@ -106,10 +107,10 @@ def torch_rollout(
 
 
 def _check_tensor(name: str, tensor: torch.Tensor, *dtypes: torch.dtype) -> None:
-    """Raise UsageError for a tensor of another type, or one that is not on the CPU."""
-    if tensor.dtype not in dtypes or tensor.device.type != "cpu":
-        wanted = " or ".join(map(str, dtypes))
-        raise UsageError(f"{name} must be a CPU tensor of {wanted}, got {tensor.dtype} on {tensor.device}")
+    """Raise UsageError for a tensor of another type, a sparse one, or one that is not on the CPU."""
+    if tensor.dtype not in dtypes or tensor.device.type != "cpu" or tensor.layout != torch.strided:
+        wanted, layout = " or ".join(map(str, dtypes)), "" if tensor.layout == torch.strided else "sparse "
+        raise UsageError(f"{name} must be a CPU tensor of {wanted}, got {layout}{tensor.dtype} on {tensor.device}")
 
 
 def _all_params(sim: Simulator, params: Mapping[str, torch.Tensor]) -> torch.Tensor:

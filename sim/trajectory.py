@@ -12,7 +12,7 @@ from gelflow.sim.arguments import integer, number_array
 from gelflow.sim.reductions import TactileReduction
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TouchStop:
     """Stops an environment of a rollout when its markers report a touch.
 
@@ -44,7 +44,7 @@ class TouchStop:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Trajectory:
     """A recorded rollout of N environments. The first axis is time, the second the environment.
 
@@ -92,7 +92,7 @@ class Trajectory:
         return array
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TrajectoryGradient:
     """Gradient of a scalar with respect to the inputs of a rollout; for quaternions the tangent gradient."""
 

@@ -1,4 +1,4 @@
-"""Shared test set-up: pictures without a display, reproducible examples, a separate cache, signals."""
+"""Shared test set-up: pictures without a display, threads, reproducible examples, a separate cache, signals."""
 
 import os
 import signal
@@ -8,6 +8,9 @@ import pytest
 from hypothesis import settings
 
 os.environ.setdefault("MPLBACKEND", "Agg")
+# Tests run in one process per core: several threads of NumPy and torch in each only wait for one another.
+for _library in ("OPENBLAS", "MKL"):
+    os.environ.setdefault(f"{_library}_NUM_THREADS", "1")
 
 # A shell ignores SIGINT for background jobs, nohup ignores SIGHUP, and child processes inherit that: tests of signals
 # need the defaults.

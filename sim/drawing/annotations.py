@@ -204,7 +204,8 @@ def _draw_panel(box: Any, pad: PadReading, scales: ForceScales) -> None:
         if np.linalg.norm(end - start) > 1:
             _arrow(box, start, end, _INK, 1)
     y = height - 12
-    box[y - 8 : y, 6:36] = marker_colors(np.linspace(0, 1, 30))
+    bar = box[max(y - 8, 0) : max(y, 0), 6:36]  # cut off where the picture is too small
+    bar[:] = marker_colors(np.linspace(0, 1, 30))[: bar.shape[1]]
     _text(box, quantity(scales.normal, "N"), (40, y))
     half = width // 2 + 8
     _arrow(box, np.array([half, y - 4.0]), np.array([half + longest, y - 4.0]), _INK, 1)

@@ -118,6 +118,7 @@ def render(
     arguments.check_type("sim", sim, Simulator, "a Simulator")
     if not isinstance(marks, Sequence) or not all(isinstance(mark, Mark) for mark in marks):
         raise UsageError(f"marks must be a list of Mark, got {arguments.shown(marks)}")
+    arguments.check_type("title", title, str, "a string")
     return _renderers.setdefault(sim, Renderer(sim)).picture(env, size, camera, title=title, marks=marks)
 
 

@@ -8,12 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
-from gelflow.geometry import Pose
-from gelflow.sim import arguments
+from gelflow.geometry import Pose, multiply
+from gelflow.sim import _core, arguments
 from gelflow.sim.scene import Scene
 from gelflow.sim.scene.geometry.distance_grid import DistanceGrid
 from gelflow.sim.scene.geometry.mesh import TriangleMesh
 from gelflow.sim.scene.mjcf.mechanics import WORLD, GeomDef
+from gelflow.sim.scene.model_spec import core_shape
 from gelflow.sim.scene.pads import PadDef
 from gelflow.sim.scene.shapes import ShapeDef
 from gelflow.sim.simulator import Simulator
@@ -24,7 +25,7 @@ DRAWN_KINDS = ("plane", "sphere", "box", "cylinder", "capsule", "ellipsoid", "me
 _NO_FORCE = 1e-6  # [N]; smaller contact forces are not drawn
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Mark:
     """A line that is drawn into the scene, such as the outline of a goal. Raises UsageError for invalid points."""
 
@@ -36,10 +37,11 @@ class Mark:
         if points.ndim != 2 or points.shape[1] != 3 or not len(points) or not np.isfinite(points).all():
             given = arguments.shown(self.points)
             raise UsageError(f"points of a mark must be a list of [x, y, z], all finite, got {given}")
+        arguments.check_type("the label of a mark", self.label, str, "a string")
         object.__setattr__(self, "points", points)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ContactForce:
     """The total force of a contact on the body of its points."""
 
@@ -48,7 +50,7 @@ class ContactForce:
     force: Array  # in the world [N], shape (3,)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PadReading:
     """Markers of a pad with their forces."""
 
@@ -59,7 +61,7 @@ class PadReading:
     normal: Array  # ≥ 0 in compression [N], shape (n,)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SceneDrawing:
     """One environment as it is drawn."""
 
@@ -99,9 +101,7 @@ def drawn_geoms(sim: Simulator, env: int) -> tuple[GeomDef, ...]:
 
 
 def _shape_geom(sim: Simulator, env: int, shape: ShapeDef, file: GeomDef | None) -> GeomDef:
-    position = [_parameter(sim, env, f"{shape.name}.shape.pos.{axis}") for axis in "xyz"]
-    size = np.array([_parameter(sim, env, f"{shape.name}.size.{axis}") for axis in "xyz"])
-    pose = replace(shape.pose, position=np.array(position))
+    size, pose = _vector(sim, env, "shape", f"{shape.name}.size"), _pose(sim, env, "shape", shape.name, shape.pose)
     if shape.grid is None:
         return GeomDef(shape.name, shape.body, shape.kind, pose, size)
     mesh = file.mesh if file is not None and file.mesh is not None else grid_mesh(shape.grid)
@@ -109,9 +109,20 @@ def _shape_geom(sim: Simulator, env: int, shape: ShapeDef, file: GeomDef | None)
     return GeomDef(shape.name, shape.body, shape.kind, pose, size, scaled)
 
 
-def _parameter(sim: Simulator, env: int, name: str) -> float:
-    kind = f"shape:{name}"  # where elements of different kinds have one name
-    return float(sim.param(kind if kind in sim.param_index else name)[env])
+def _pose(sim: Simulator, env: int, kind: str, name: str, pose: Pose) -> Pose:
+    """The pose in its body of a shape or a point set of an environment; `pose` is that of the scene."""
+    position, turn = (_vector(sim, env, kind, f"{name}.{kind}.{key}") for key in ("pos", "turn"))
+    half = np.linalg.norm(turn) / 2
+    rotation = (np.cos(half), *(0.5 * np.sinc(half / np.pi) * turn))
+    return Pose(position, np.array(multiply(pose.quaternion, rotation)))
+
+
+def _vector(sim: Simulator, env: int, kind: str, name: str) -> Array:
+    """Three parameters of an environment, with the endings x, y and z."""
+    names = [f"{name}.{axis}" for axis in "xyz"]
+    if f"{kind}:{names[0]}" in sim.param_index:  # where elements of different kinds have one name
+        names = [f"{kind}:{name}" for name in names]
+    return np.array([float(sim.param(name)[env]) for name in names])
 
 
 def grid_mesh(grid: DistanceGrid) -> TriangleMesh:
@@ -143,15 +154,33 @@ def _contact_forces(sim: Simulator, env: int, poses: Sequence[Pose]) -> tuple[Co
         if not np.linalg.norm(force) > _NO_FORCE:
             continue
         cloud, shape = clouds[contact.points], shapes[contact.shape]
-        points = cloud.points if cloud.body == WORLD else poses[cloud.body].apply(cloud.points)
-        frame = shape.pose if shape.body == WORLD else poses[shape.body] @ shape.pose
-        distance, normal = sim.model.distance(shape.name, frame.inverse().apply(points))[:2]
+        scaled = _vector(sim, env, "points", f"{cloud.name}.points.scale") * cloud.pose.inverse().apply(cloud.points)
+        points = _pose(sim, env, "points", cloud.name, cloud.pose).apply(scaled)
+        points = points if cloud.body == WORLD else poses[cloud.body].apply(points)
+        frame = _pose(sim, env, "shape", shape.name, shape.pose)
+        frame = frame if shape.body == WORLD else poses[shape.body] @ frame
+        distance, normal = _distance(sim, env, shape, frame.inverse().apply(points))
         points = points - cloud.radius * normal @ frame.matrix().T  # of a sphere, the point next to the shape
         distance = distance - cloud.radius
         depth = np.maximum(-distance, 0)
         point = depth @ points / depth.sum() if depth.sum() > 0 else points[np.argmin(distance)]
         found.append(ContactForce(contact.name, np.asarray(point), force))
     return tuple(found)
+
+
+def _distance(sim: Simulator, env: int, shape: ShapeDef, points: Array) -> tuple[Array, Array]:
+    """Distances (n,) and normals (n, 3) of a shape, with the size that an environment has, at points in its frame."""
+    size = _vector(sim, env, "shape", f"{shape.name}.size")
+    model = sim.model
+    if not np.array_equal(size, shape.size):
+        spec = _core.ModelSpec()
+        # A model needs something that can move.
+        body = spec.add_body(_core.BodyDef(name="body", mass=1.0, inertia=[1.0, 1.0, 1.0, 0.0, 0.0, 0.0]))
+        spec.add_joint(_core.JointDef(name="joint", body=body, type="slide", axis=[1.0, 0.0, 0.0]))
+        spec.add_shape(core_shape(replace(shape, body=WORLD, size=size)))
+        model = _core.Model(spec)
+    distance, normal = model.distance(shape.name, points)[:2]
+    return distance, normal
 
 
 def _pad_readings(sim: Simulator, env: int, poses: Sequence[Pose]) -> tuple[PadReading, ...]:

@@ -34,7 +34,7 @@ def add_contacts(
     pads: Sequence[PadDef],
 ) -> None:
     """Add shapes and point sets, and the contacts and pads that refer to them by name."""
-    shape_index = {shape.name: spec.add_shape(_shape(shape)) for shape in shapes}
+    shape_index = {shape.name: spec.add_shape(core_shape(shape)) for shape in shapes}
     points_index = {p.name: spec.add_points(_points(p)) for p in points}
     for contact in contacts:
         spec.add_contact(_contact(contact, points_index, shape_index))
@@ -104,7 +104,8 @@ def _joint(joint: JointDef, limit: JointLimit) -> _core.JointDef:
     )
 
 
-def _shape(shape: ShapeDef) -> _core.ShapeDef:
+def core_shape(shape: ShapeDef) -> _core.ShapeDef:
+    """The definition of a shape for the core."""
     grid = shape.grid
     return _core.ShapeDef(
         name=shape.name,

@@ -30,7 +30,7 @@ DEFAULT_TOLERANCE = 1e-7  # of Newton's method
 DEFAULT_INTEGRATOR = "bdf2"  # the reasons are in docs/reference/accuracy.md
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Scene:
     """A scene: bodies, joints, actuators, contact geometry and tactile pads.
 
@@ -165,6 +165,8 @@ class Scene:
             raise UsageError(f"{self.path}: a contact or pad refers to {error}, which the scene lacks") from None
         except ValueError as error:
             raise UsageError(f"{self.path}: {error}") from None
+        except TypeError as error:  # of pybind11, whose message has many lines
+            raise UsageError(f"{self.path}: a value has a wrong type or shape: {str(error).splitlines()[0]}") from None
 
     def _joint(self, name: str) -> JointDef:
         return self.joints[_index("joint", name, [joint.name for joint in self.joints])]

@@ -59,6 +59,7 @@ class CapRotationTask(ControlDescription):
     command_unit: float = 0.1  # of differences between commanded and measured angles
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.reward not in REWARDS:
             raise UsageError(f"reward must be one of {', '.join(REWARDS)}, got {self.reward!r}")
 

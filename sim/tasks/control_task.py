@@ -11,6 +11,7 @@ from typing import Any, Unpack
 import numpy as np
 from gymnasium.spaces import Box
 
+from gelflow.errors import UsageError
 from gelflow.sim.scene import Scene, load_scene
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.tasks.randomization import Randomization
@@ -25,6 +26,12 @@ class ControlDescription(TaskDescription):
 
     control_period: float = 0.025  # [s]
     max_steps: int = 100  # control periods of an episode, after which it is truncated
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.control_period > 0 or self.max_steps < 1:
+            given = f"{self.control_period} and {self.max_steps}"
+            raise UsageError(f"control_period must be positive and max_steps at least 1, got {given}")
 
     @property
     def observation_size(self) -> int:

@@ -58,6 +58,12 @@ class GraspTask(TaskDescription):
     force_cost: float = 1.0  # reward for success falls by this for each N of a chosen force
 
     def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.sensors != len(PADS) or self.attempts < 1:
+            given = f"{self.sensors} and {self.attempts}"
+            raise UsageError(f"sensors must be {len(PADS)} and attempts at least 1, got {given}")
+        if min(times := (self.close_time, self.lift_time, self.hold_time)) < 0 or not self.lift_time > 0:
+            raise UsageError(f"close_time, lift_time and hold_time must not be negative, lift_time not 0, got {times}")
         if self.force_range is not None and not 0 < self.force_range[0] < self.force_range[1] <= 20:
             raise UsageError(f"force_range must be 0 < low < high ≤ 20 N, got {self.force_range}")
 

@@ -68,6 +68,7 @@ class PushingTask(ControlDescription):
     mass_unit: float = 0.1  # [kg]
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.observation not in OBSERVATIONS:
             raise UsageError(f"observation must be one of {', '.join(OBSERVATIONS)}, got {self.observation!r}")
         if self.history < 1:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import numbers
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
@@ -27,6 +28,11 @@ class Distribution(Protocol):
         """The same kind of distribution, between `low` and `high`."""
 
 
+def _check_numbers(distribution: Distribution) -> None:
+    for name, value in vars(distribution).items():
+        check_type(name, value, numbers.Real, "a number")
+
+
 @dataclass(frozen=True)
 class Uniform:
     """Uniform between `low` and `high`."""
@@ -35,6 +41,7 @@ class Uniform:
     high: float
 
     def __post_init__(self) -> None:
+        _check_numbers(self)
         if not 0 <= self.high - self.low < math.inf:
             raise UsageError(f"a range must be (low, high) with low ≤ high, got ({self.low}, {self.high})")
 
@@ -53,6 +60,7 @@ class LogUniform:
     high: float
 
     def __post_init__(self) -> None:
+        _check_numbers(self)
         if not 0 <= self.high - self.low < math.inf:
             raise UsageError(f"a range must be (low, high) with low ≤ high, got ({self.low}, {self.high})")
         if not self.low > 0:
@@ -72,6 +80,11 @@ class Normal:
     mean: float
     std: float
 
+    def __post_init__(self) -> None:
+        _check_numbers(self)
+        if not 0 <= self.std < math.inf or not math.isfinite(self.mean):
+            raise UsageError(f"a normal distribution needs a finite mean and std ≥ 0, got ({self.mean}, {self.std})")
+
     def sample(self, rng: np.random.Generator, count: int) -> Array:
         return rng.normal(self.mean, self.std, count)
 
@@ -84,6 +97,11 @@ class Fixed:
     """Always `value`; uses no random number."""
 
     value: float
+
+    def __post_init__(self) -> None:
+        _check_numbers(self)
+        if not math.isfinite(self.value):
+            raise UsageError(f"a fixed value must be finite, got {self.value}")
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:
         return np.full(count, float(self.value))

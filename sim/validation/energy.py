@@ -5,6 +5,7 @@ from its anchor. The core sums forces and does not store values of single points
 has the same points, shapes and anchors as markers of stiffness 1, whose forces are −d n and −s.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -38,8 +39,8 @@ class Energy:
     gravity: Array  # of weights and gravity compensation; zero at the origin of the world
     contact: Array  # ½ k_n d² of all contact points; markers that do not collide store none
     friction: Array  # ½ k_s |s|² of all contact points
-    springs: Array  # of joint springs
-    limits: Array  # of joint limits
+    springs: Array  # of the springs of joints and tendons
+    limits: Array  # of the limits of joints and tendons
 
     @property
     def total(self) -> Array:
@@ -54,12 +55,20 @@ class EnergyGauge:
     ----------
     scene: the `Scene`, or another object with the definitions of the simulator's model
     num_envs: number of environments of the simulators
+
+    Raises UsageError for a scene with loop closures, or with couplings that springs keep.
     """
 
     def __init__(self, scene: HasModelSpec, *, num_envs: int = 1) -> None:
         check_type("scene", scene, HasModelSpec, "a Scene (see load_scene)")
-        spec, self._weights = _probe_spec(scene.model_spec())
-        self._probe = Simulator(_core.Model(spec), num_envs=num_envs)
+        spec = scene.model_spec()
+        kept = [closure.name for closure in spec.loop_closures]
+        kept += [coupling.name for coupling in spec.couplings if len(coupling.coefficients) > 2]
+        if kept:
+            raise UsageError(f"the energy of the springs that keep {kept[0]!r} is not computed")
+        probe, self._contacts = _probe_spec(spec)
+        self._probe = Simulator(_core.Model(probe), num_envs=num_envs)
+        self._tendons = spec.tendons
 
     def read(self, sim: Simulator) -> Energy:
         """Energy of the present state of a simulator. Raises UsageError for another number of environments or scene."""
@@ -70,19 +79,26 @@ class EnergyGauge:
             raise UsageError("the simulator must be one of the scene of the gauge")
         kinetic = 0.5 * np.einsum("ni,nij,nj->n", sim.v, sim.mass_matrix(), sim.v)
         contact, friction = self._stored(sim, *self.points(sim))
-        springs, limits = joint_energies(sim)
+        springs, limits = joint_energies(sim, self._tendons)
         return Energy(kinetic, _gravity(sim), contact, friction, springs, limits)
 
     def points(self, sim: Simulator) -> tuple[Array, Array]:
         """Depth (N, points), 0 outside, and strain (N, points, 3) in the body's axes, of all contact points [m].
 
-        Points are ordered by contact: those of `ModelSpec.contacts`, then those of colliding pads.
+        Points are ordered by contact: those of `ModelSpec.contacts`, then those of colliding pads. Raises UsageError
+        for points with another scale than 1.
         """
         probe, numbers = self._probe, set(CONTACT_PARAMS)
-        columns = {name: i for i, name in enumerate(sim.model.param_names)}
         for i, name in enumerate(probe.model.param_names):
-            if name in columns and name.rsplit(".", 1)[-1] not in numbers:
-                probe.params[:, i] = sim.params[:, columns[name]]
+            if name.rsplit(".", 1)[-1] not in numbers and (same := _names(sim, name, "body", "joint", "shape")):
+                probe.params[:, i] = sim.param(same[0])
+        for contact, (_, points) in self._contacts.items():
+            for axis in "xyz":
+                for pose in ("pos", "turn"):
+                    probe.param(f"{contact}.markers.{pose}.{axis}")[:] = sim.param(f"{points}.{pose}.{axis}")
+                scale = f"{points}.scale.{axis}"
+                if scale in sim.param_index and (sim.param(scale) != 1).any():
+                    raise UsageError(f"the energy of scaled points is not computed; {scale} must be 1")
         probe.q[:], probe.v[:] = sim.q, 0
         probe.anchored[:] = 0
         for name, start in _anchor_starts(sim).items():
@@ -101,7 +117,7 @@ class EnergyGauge:
     def _stored(self, sim: Simulator, depth: Array, strain: Array) -> tuple[Array, Array]:
         contact, friction = np.zeros(sim.num_envs), np.zeros(sim.num_envs)
         anchor_starts = _anchor_starts(sim)
-        for name, weights in self._weights.items():
+        for name, (weights, _) in self._contacts.items():
             own = self._probe.marker_slice(name)
             contact += 0.5 * _number(sim, name, "kn") * (depth[:, own] ** 2 @ weights)
             if anchor_starts[name] >= 0:
@@ -130,9 +146,14 @@ def actuator_forces(scene: Scene, sim: Simulator, u: ArrayLike) -> Array:
 
 
 def _number(sim: Simulator, contact: str, number: str) -> Array:
-    """Parameter of a contact, (N,); contacts of a pad with several shapes have those of the pad."""
-    own = f"{contact}.{number}"
-    return sim.param(own if own in sim.model.param_names else f"{contact.split('/')[0]}.{number}")
+    """Parameter of a contact, (N,); contacts of colliding pads have those of the pad."""
+    own = _names(sim, f"{contact}.{number}", "contact")
+    return sim.param((own or _names(sim, f"{contact.split('/')[0]}.{number}", "pad"))[0])
+
+
+def _names(sim: Simulator, name: str, *kinds: str) -> list[str]:
+    """The names of a parameter that `sim` has: its own, or with its kind, where elements of several have one name."""
+    return [known for known in (name, *(f"{kind}:{name}" for kind in kinds)) if known in sim.param_index]
 
 
 def _gravity(sim: Simulator) -> Array:
@@ -150,22 +171,24 @@ def _gravity(sim: Simulator) -> Array:
     return result
 
 
-def joint_energies(sim: Simulator) -> tuple[Array, Array]:
-    """Energies [J] of the springs of all joints, and of the springs at their limits, (N,) each."""
-    springs, limits = np.zeros(sim.num_envs), np.zeros(sim.num_envs)
+def joint_energies(sim: Simulator, tendons: Sequence[_core.TendonDef] = ()) -> tuple[Array, Array]:
+    """Energies [J] of the springs of all joints and of `tendons`, and of the springs at their limits, (N,) each."""
     ends = [*sim.model.joint_q[1:], sim.model.nq]
-
-    def param(joint: str, key: str) -> Array:
-        qualified = f"joint:{joint}.{key}"  # where elements of different kinds have one name
-        return sim.param(qualified if qualified in sim.param_index else f"{joint}.{key}")
-
-    for name, q, end in zip(sim.model.joint_names, sim.model.joint_q, ends, strict=True):
-        if end - q > 1:  # a ball or free joint has no spring and no limits
-            continue
-        value = sim.q[:, q]
-        springs += 0.5 * param(name, "stiffness") * (value - param(name, "springref")) ** 2
-        beyond = np.maximum(value - param(name, "upper"), 0) + np.maximum(param(name, "lower") - value, 0)
-        limits += 0.5 * param(name, "limit_stiffness") * beyond**2
+    joints = zip(sim.model.joint_names, sim.model.joint_q, ends, strict=True)
+    # A ball or free joint has no spring and no limits.
+    values = [("joint", name, sim.q[:, q]) for name, q, end in joints if end - q == 1]
+    for tendon in tendons:
+        positions = sim.q[:, [sim.model.joint_q[joint] for joint in tendon.joints]]
+        values.append(("tendon", tendon.name, positions @ np.array(tendon.coefficients)))
+    springs, limits = np.zeros(sim.num_envs), np.zeros(sim.num_envs)
+    for kind, name, value in values:
+        stiffness, rest, lower, upper, limit_stiffness = (
+            sim.param(_names(sim, f"{name}.{key}", kind)[0])
+            for key in ("stiffness", "springref", "lower", "upper", "limit_stiffness")
+        )
+        springs += 0.5 * stiffness * (value - rest) ** 2
+        beyond = np.maximum(value - upper, 0) + np.maximum(lower - value, 0)
+        limits += 0.5 * limit_stiffness * beyond**2
     return springs, limits
 
 
@@ -174,12 +197,13 @@ def _anchor_starts(sim: Simulator) -> dict[str, int]:
     return dict(zip(sim.model.contact_names, sim.model.contact_anchors, strict=True))
 
 
-def _probe_spec(spec: _core.ModelSpec) -> tuple[_core.ModelSpec, dict[str, Array]]:
-    """The probe: the same bodies and shapes, a pad in place of each contact; and the weights of its points, by name.
+def _probe_spec(spec: _core.ModelSpec) -> tuple[_core.ModelSpec, dict[str, tuple[Array, str]]]:
+    """The probe: the same bodies and shapes, a pad in place of each contact; and by its name the weights of its points,
+    and whose parameters they are ("box.points").
 
     The pads are elastic, of stiffness 1, so that marker i has anchor i.
     """
-    result, shapes, weights = _core.ModelSpec(), spec.shapes, {}
+    result, shapes, used = _core.ModelSpec(), spec.shapes, {}
     for body in spec.bodies:
         result.add_body(body)
     for joint in spec.joints:
@@ -187,14 +211,14 @@ def _probe_spec(spec: _core.ModelSpec) -> tuple[_core.ModelSpec, dict[str, Array
     for shape in shapes:
         result.add_shape(shape)
     sets = spec.points
-    contacts = [(c.name, sets[c.points], c.shape) for c in spec.contacts]
+    contacts = [(c.name, sets[c.points], c.shape, f"{sets[c.points].name}.points") for c in spec.contacts]
     for pad in spec.pads:
         if pad.collides:
             points = _core.PointsDef(
                 name=pad.name, body=pad.body, points=pad.positions, weights=pad.weights, pos=pad.pos, quat=pad.quat
             )
-            contacts += [(_pad_contact(pad, shapes[index]), points, index) for index in pad.shapes]
-    for name, points, index in contacts:
+            contacts += [(_pad_contact(pad, shapes[i]), points, i, f"{pad.name}.markers") for i in pad.shapes]
+    for name, points, index, owner in contacts:
         touched = index if points.radius == 0 else result.add_shape(_raised(shapes[index], points.radius, name))
         result.add_pad(
             _core.PadDef(
@@ -212,8 +236,9 @@ def _probe_spec(spec: _core.ModelSpec) -> tuple[_core.ModelSpec, dict[str, Array
                 quat=points.quat,
             )
         )
-        weights[name] = np.ones(len(points.points)) if points.weights is None else np.array(points.weights)
-    return result, weights
+        weights = np.ones(len(points.points)) if points.weights is None else np.array(points.weights)
+        used[name] = weights, owner
+    return result, used
 
 
 def _pad_contact(pad: _core.PadDef, shape: _core.ShapeDef) -> str:

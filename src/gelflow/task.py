@@ -8,6 +8,8 @@ CoRL 2022.
 import dataclasses
 import hashlib
 import json
+import math
+import numbers
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -40,6 +42,13 @@ class TaskDescription:
     format: int = 1
     name: str = ""
 
+    def __post_init__(self) -> None:
+        """Raises UsageError for a value of another type than the default, and for a number that is not finite."""
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if (expected := _expected(field.default, value)) is not None:
+                raise UsageError(f"{field.name} must be {expected}, got {' '.join(repr(value).split())}")
+
     def to_json(self) -> dict[str, Any]:
         """As plain data, for checkpoints and recordings."""
         return json.loads(json.dumps(dataclasses.asdict(self)))  # type: ignore[no-any-return]
@@ -64,6 +73,23 @@ class TaskDescription:
     def digest(self) -> str:
         """A short hash: equal for equal descriptions."""
         return hashlib.sha256(json.dumps(self.to_json(), sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _expected(default: Any, value: Any) -> str | None:
+    """The type and range that a value should have and has not, by the default of its field; None if it has them."""
+    if isinstance(default, tuple):
+        is_right = isinstance(value, tuple | list) and all(_is_finite(number) for number in value)
+        return None if is_right else "a tuple of finite numbers"
+    if isinstance(default, bool) or not isinstance(default, int | float):
+        return None if default is None or isinstance(value, type(default)) else f"a {type(default).__name__}"
+    if isinstance(default, int):
+        return None if _is_finite(value) and value == int(value) else "an integer"
+    return None if _is_finite(value) else "a finite number"
+
+
+def _is_finite(value: Any) -> bool:
+    """Whether a value is a finite number."""
+    return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
 
 
 @dataclass(frozen=True)
@@ -95,6 +121,7 @@ class InsertionTask(TaskDescription):
     observation: str = "flow map"
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.observation not in OBSERVATIONS:
             raise UsageError(f"observation must be one of {', '.join(OBSERVATIONS)}, got {self.observation!r}")
 

@@ -5,6 +5,7 @@
 #include <mutex>
 #include <string>
 
+#include "../python/interpreter_lock.hpp"
 #include "contact_fit.hpp"
 
 namespace py = pybind11;
@@ -89,7 +90,7 @@ struct SharedFitter {
   ContactFit run(const HeldEquations& image, const Fit& fit) {
     if (py::ssize_t(image.projected.size()) != 3 * fitter.grid().cells)
       throw std::invalid_argument("the equations have a size that does not fit the grid");
-    py::gil_scoped_release release;
+    const WithoutInterpreterLock released;
     const std::lock_guard lock(mutex);
     return fit(fitter, image);
   }

@@ -2,10 +2,10 @@
 #pragma once
 
 #include <cstring>
-#include <sstream>
 #include <stdexcept>
 
 #include "batch/batch.hpp"
+#include "dynamics/state_checks.hpp"
 
 namespace gelflow {
 
@@ -82,28 +82,9 @@ void Batch<T>::check_controls(const T* u, int rows, const std::uint8_t* active) 
 
 template <class T>
 void Batch<T>::check_state(const T* positions, const T* velocities, const std::uint8_t* active) const {
-  const auto check = [&](const T* values, const char* what, std::size_t width) {
-    for (std::size_t i = 0; i < n * width; ++i) {
-      if (is_finite(values[i]) || (active != nullptr && active[i / width] == 0)) continue;
-      throw std::invalid_argument(std::string(what) + "[" + std::to_string(i / width) + ", " +
-                                  std::to_string(i % width) + "] is not finite");
-    }
-  };
-  check(positions, "q", model->nq);
-  check(velocities, "v", model->nv);
-  for (const Joint& joint : model->joints) {
-    if (!joint.has_quaternion()) continue;
-    const int first = joint.quaternion_q();
-    for (int e = 0; e < n; ++e) {
-      const V4<T> quaternion = vec4(positions + static_cast<std::size_t>(e) * model->nq + first);
-      constexpr double shortest = 1e-6;
-      if (quaternion.squaredNorm() >= T(shortest * shortest) || (active != nullptr && active[e] == 0)) continue;
-      std::ostringstream text;
-      text << "environment " << e << ": the quaternion of joint '" << joint.name << "', q[" << first << ":" << first + 4
-           << "], has length " << quaternion.stableNorm() << "; it must have length 1";
-      throw std::invalid_argument(text.str());
-    }
-  }
+  check_finite(positions, "q", n, model->nq, active);
+  check_finite(velocities, "v", n, model->nv, active);
+  check_quaternions(*model, positions, n, active);
 }
 
 template <class T>

@@ -3,6 +3,9 @@
 #include <algorithm>
 #include <condition_variable>
 #include <mutex>
+#include <stdexcept>
+#include <string>
+#include <system_error>
 #include <thread>
 #include <vector>
 
@@ -98,10 +101,21 @@ class ThreadPool::Workers {
   explicit Workers(int count) {
     for (int i = 1; i <= count; ++i) {
       Worker& worker = *workers_.emplace_back(std::make_unique<Worker>());
-      worker.thread = std::thread([this, &worker, i] { loop(worker, i); });
+      try {
+        worker.thread = std::thread([this, &worker, i] { loop(worker, i); });
+      } catch (const std::system_error&) {
+        workers_.pop_back();
+        stop();
+        throw std::invalid_argument("cannot start thread " + std::to_string(i + 1) + " of " +
+                                    std::to_string(count + 1) + "; choose fewer threads");
+      }
     }
   }
-  ~Workers() {
+  ~Workers() { stop(); }
+  void run(int items, const std::function<void(int, int)>& work, Interruption& interruption);
+
+ private:
+  void stop() {
     {
       const std::lock_guard lock(mutex_);
       stop_ = true;
@@ -109,9 +123,6 @@ class ThreadPool::Workers {
     start_.notify_all();
     for (const auto& worker : workers_) worker->thread.join();
   }
-  void run(int items, const std::function<void(int, int)>& work, Interruption& interruption);
-
- private:
   void loop(Worker& worker, int thread);
   void work_on_items(int thread);
   std::vector<std::unique_ptr<Worker>> workers_;

@@ -236,7 +236,8 @@ VX<T> dposition_dposition_vjp(const Model& m, const VX<T>& increment, VX<T> lamb
   return lambda;
 }
 
-// Gradients with respect to q: from quaternion components to the tangent (right perturbation), and back.
+// Gradients with respect to q: from quaternion components to the tangent (right perturbation), and back. Quaternions may
+// have any length: the dynamics normalize them.
 template <class T>
 VX<T> to_tangent(const Model& m, const T* q, const T* gradient) {
   VX<T> result(m.nv);
@@ -262,7 +263,8 @@ void add_from_tangent(const Model& m, const T* q, const VX<T>& tangent, T* gradi
     if (!joint.has_quaternion()) continue;
     const int k = joint.angular_v();
     const V4<T> turning(T(0), tangent[k], tangent[k + 1], tangent[k + 2]);
-    const V4<T> mapped = quaternion_product<T>(vec4(q + joint.quaternion_q()), turning) * T(2);
+    const V4<T> quaternion = vec4(q + joint.quaternion_q());
+    const V4<T> mapped = quaternion_product<T>(quaternion, turning) * (T(2) / quaternion.squaredNorm());
     for (int i = 0; i < 4; ++i) gradient[joint.quaternion_q() + i] += mapped[i];
   }
 }

@@ -67,6 +67,16 @@ std::string message(const std::string& name, const char* required, T got) {
   return text.str();
 }
 
+// Of joints or tendons.
+template <class Elements, class T>
+std::string wrong_limits(const Elements& elements, const T* params) {
+  for (const auto& element : elements) {
+    const auto p = element.params.in(params);
+    if (p.lower > p.upper) return message(element.name + ".lower", "be at most the upper limit", p.lower);
+  }
+  return {};
+}
+
 }  // namespace
 
 ParamSign param_sign(std::string_view name, double value) {
@@ -95,10 +105,13 @@ std::string wrong_parameter(const Model& model, const T* params) {
       return message(model.param_names[i], "not be negative", params[i]);
     }
   }
+  std::string wrong = wrong_limits(model.joints, params);
+  if (wrong.empty()) wrong = wrong_limits(model.tendons, params);
+  if (!wrong.empty()) return wrong;
   for (const Body& body : model.bodies) {
     const M3<double> before = body.params.in(model.param_defaults.data()).inertia();
     const M3<double> now = body.params.in(params).inertia().template cast<double>();
-    const std::string wrong = wrong_inertia(now);
+    wrong = wrong_inertia(now);
     if (!wrong.empty() && wrong_inertia(before).empty()) {
       std::ostringstream text;
       text << "the inertia of body '" << body.name << "' must " << wrong << ", got xx yy zz xy xz yz " << now(0, 0)

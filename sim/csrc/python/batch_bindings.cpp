@@ -5,6 +5,7 @@
 
 #include "python/arrays.hpp"
 #include "python/bindings.hpp"
+#include "python/interpreter_lock.hpp"
 
 namespace gelflow {
 
@@ -57,7 +58,7 @@ void call(Batch<T>& b, const Work& work) {
     return PyErr_CheckSignals() != 0;
   });
   {
-    const py::gil_scoped_release release;
+    const WithoutInterpreterLock released;
     work();
   }
   if (b.interruption().requested()) throw py::error_already_set();

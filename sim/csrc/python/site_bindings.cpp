@@ -1,5 +1,6 @@
 // Sites and their poses.
 #include "dynamics/site_poses.hpp"
+#include "dynamics/state_checks.hpp"
 #include "python/arrays.hpp"
 #include "python/bindings.hpp"
 
@@ -9,7 +10,7 @@ namespace {
 
 using Sites = std::vector<SiteDef>;
 
-// The rows of a call, after checks of its arrays.
+// The rows of a call, after checks of its arrays and their values.
 SiteRows checked(const Model& m, const Sites& sites, const Array<double>& params, const Array<double>& q) {
   const py::ssize_t rows = q.ndim() == 2 ? q.shape(0) : 0, n = params.ndim() == 2 ? params.shape(0) : 0;
   check_shape(q, {rows, m.nq}, "q");
@@ -19,6 +20,12 @@ SiteRows checked(const Model& m, const Sites& sites, const Array<double>& params
     if (site.body < world || site.body >= static_cast<int>(m.bodies.size())) {
       throw std::invalid_argument("site '" + site.name + "' refers to body " + std::to_string(site.body));
     }
+  }
+  check_finite(q.data(), "q", static_cast<int>(rows), m.nq, nullptr);
+  check_quaternions(m, q.data(), static_cast<int>(rows), nullptr);
+  for (py::ssize_t i = 0; i < n; ++i) {
+    const std::string wrong = wrong_parameter(m, params.data(i, 0));
+    if (!wrong.empty()) throw std::invalid_argument("environment " + std::to_string(i) + ": " + wrong);
   }
   return {q.data(), params.data(), static_cast<int>(rows), static_cast<int>(n)};
 }

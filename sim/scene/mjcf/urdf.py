@@ -36,7 +36,18 @@ def read_urdf(path: Path) -> ElementTree.Element | None:
     if any("xacro" in str(element.tag) for element in root.iter()):
         raise UsageError(f"{path}: has xacro macros, which are not expanded; run xacro and load its output")
     _mimic_joints(root, path)  # its errors are clearer than those of MuJoCo's parser
+    _check_floating(root, path)
     return root
+
+
+def _check_floating(robot: ElementTree.Element, path: Path) -> None:
+    """Raises UsageError for a floating joint below another link than the world, which MuJoCo does not simulate."""
+    for joint in robot.findall("joint"):
+        parent = joint.find("parent")
+        link = "" if parent is None else parent.get("link", "")
+        if joint.get("type") == "floating" and link != "world":
+            name = joint.get("name", "")
+            raise UsageError(f"{path}: joint {name!r} is floating, so its parent must be called 'world', got {link!r}")
 
 
 def complete_urdf(spec: Any, robot: ElementTree.Element, path: Path) -> None:
@@ -113,9 +124,11 @@ def _correct_ranges(spec: Any, robot: ElementTree.Element, path: Path) -> None:
                 if found.name == name:
                     found.limited = mujoco.mjtLimited.mjLIMITED_FALSE
             continue
-        lower, upper = float(limit.get("lower", 0)), float(limit.get("upper", 0))
-        if lower > upper or lower == upper != 0:
+        lower, upper, effort = (float(limit.get(key, 0)) for key in ("lower", "upper", "effort"))
+        if not lower <= upper or lower == upper != 0:
             raise UsageError(f"{path}: joint {name!r}: lower limit {lower:g} must be below upper limit {upper:g}")
+        if not effort >= 0:
+            raise UsageError(f"{path}: joint {name!r}: the effort of <limit> must not be negative, got {effort:g}")
 
 
 def _couple(spec: Any, mimics: dict[str, tuple[str, float, float]]) -> None:

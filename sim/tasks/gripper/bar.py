@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.geometry import Pose
+from gelflow.sim.arguments import integer
 from gelflow.sim.scene import Scene
 from gelflow.sim.scene.joint_limits import JointLimit
 from gelflow.sim.scene.mjcf.mechanics import BodyDef, JointDef
@@ -31,6 +32,7 @@ class Bar:
     blocks: int
 
     def __post_init__(self) -> None:
+        integer("blocks", self.blocks)
         if not MIN_BLOCKS <= self.blocks <= MAX_BLOCKS:
             raise UsageError(f"blocks must be between {MIN_BLOCKS} and {MAX_BLOCKS}, got {self.blocks}")
 

@@ -127,3 +127,43 @@ signal.setitimer(signal.ITIMER_REAL, 0.3)
 """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120, check=False)
     return done.stderr.strip().splitlines()[-1].removeprefix("gelflow.errors.")
+
+
+def test_a_simulator_in_use_by_a_daemon_thread_does_not_abort_the_end_of_the_process() -> None:
+    script = """
+import threading, time
+import numpy as np
+from gelflow.sim import Simulator, load_scene
+
+sim = Simulator(load_scene("rolling"))
+
+def step():
+    while True:
+        sim.step(np.zeros(sim.model.nu), 5)
+
+threading.Thread(target=step, daemon=True).start()
+time.sleep(0.3)
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs a limit of the address space")
+def test_threads_that_cannot_be_started_are_refused() -> None:
+    script = """
+import resource
+from pathlib import Path
+from gelflow.errors import UsageError
+from gelflow.sim import Simulator, load_scene
+
+scene = load_scene("rolling")
+Simulator(scene, num_envs=2, threads=2).poses()
+used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (used + 100 * 2**20,) * 2)  # some twelve stacks of threads
+try:
+    Simulator(scene, num_envs=64, threads=64)
+except UsageError as error:
+    print(error)
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120, check=False)
+    assert done.stdout.startswith("cannot start thread") and done.stdout.endswith("of 64; choose fewer threads\n")

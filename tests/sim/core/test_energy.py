@@ -4,11 +4,14 @@ Free bodies are thrown on planes at random; hypothesis draws stiffness, damping,
 tolerance is ten times Newton's, relative to the energy involved.
 """
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gelflow.errors import UsageError
 from gelflow.sim import _core
 from gelflow.sim.scene import FRICTION_LAWS, load_scene, scene_names
 from gelflow.sim.simulator import Simulator
@@ -157,3 +160,34 @@ def test_energy_gain_of_scenes_is_bounded(name: str, law: str, integrator: str) 
             before = after
         sim.check()
         assert max(gains) <= MOST[law, integrator] * work
+
+
+def test_contact_points_that_were_moved_store_energy_at_their_position() -> None:
+    sim = Simulator(load_scene("pushing"), num_envs=2)
+    gauge = EnergyGauge(sim.scene, num_envs=2)
+    sim.param("box.points.pos.z")[1] -= 1e-3
+    energy, force = gauge.read(sim).contact, sim.wrenches()[:, sim.model.contact_names.index("box_ground"), 5]
+    assert energy[0] == 0 and force[1] > 1
+    np.testing.assert_allclose(energy[1], 0.5 * force[1] * 1e-3, rtol=1e-6)
+    sim.param("box.points.scale.x")[:] = 1.1
+    with pytest.raises(UsageError, match=r"box\.points\.scale\.x must be 1"):
+        gauge.read(sim)
+
+
+def test_springs_of_tendons_keep_the_energy(tmp_path: Path) -> None:
+    (tmp_path / "tendon.xml").write_text("""<mujoco><option gravity="0 0 0" timestep="1e-4"/><worldbody><body>
+      <joint name="t" type="slide" axis="1 0 0"/><geom size="0.1" mass="1"/></body></worldbody>
+      <tendon><fixed name="t" stiffness="100" springlength="0"><joint joint="t" coef="1"/></fixed></tendon></mujoco>""")
+    sim = Simulator(load_scene(tmp_path / "tendon.xml"))
+    gauge, sim.v[:] = EnergyGauge(sim.scene), 1.0
+    sim.step(np.zeros(0), 1000)
+    assert sim.v[0, 0] < 0.6
+    np.testing.assert_allclose(gauge.read(sim).total, 0.5, rtol=1e-2)
+
+
+def test_energy_of_springs_that_keep_bodies_together_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "closed.xml").write_text("""<mujoco><worldbody><body name="a"><joint/><geom size="0.1"/></body>
+      <body name="b"><joint/><geom size="0.1"/></body></worldbody>
+      <equality><connect name="pin" body1="a" body2="b" anchor="0 0 0"/></equality></mujoco>""")
+    with pytest.raises(UsageError, match="the energy of the springs that keep 'pin' is not computed"):
+        EnergyGauge(load_scene(tmp_path / "closed.xml"))

@@ -13,7 +13,9 @@ import torch
 from gelflow.cli.main import main
 from gelflow.errors import UsageError
 from gelflow.sim import _core
-from gelflow.sim.reductions import center_of_pressure, pad_forces
+from gelflow.sim.drawing.renderer import render
+from gelflow.sim.drawing.scene_drawing import Mark
+from gelflow.sim.reductions import TactileReduction, center_of_pressure, pad_forces
 from gelflow.sim.scene import load_scene
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.tasks.insertion import insertion_scene
@@ -38,6 +40,17 @@ CALLS: list[tuple[Callable[[Any], Any], str]] = [
     (lambda s: s.wrenches(3), "wrenches: arguments of these types: int"),
     (lambda s: s.step(np.zeros(6), 1.5), "steps must be an integer, got 1.5"),
     (lambda s: s.step(np.zeros(6), -1), "steps must not be negative, got -1"),
+    (lambda s: s.step(np.zeros(6), 2**31), "steps must be at most 2147483647, got 2147483648"),
+    (lambda s: s.rollout(U, read_after=np.array([2**32 + 2])), "read_after must be at most 2147483647, got 4294967298"),
+    (lambda s: type(s)(s.scene, num_envs=2**31), "num_envs must be at most"),
+    (lambda s: TactileReduction(np.zeros((1, 130, 3)), 5), "names must be the names of the rows, got 5"),  # type: ignore[arg-type]
+    (lambda s: replace(s.scene, gravity=np.zeros(2)).build(), ".*a value has a wrong type or shape"),
+    (lambda s: render(s, title=5), "title must be a string, got 5"),  # type: ignore[arg-type]
+    (lambda s: Mark(np.zeros((2, 3)), 5), "the label of a mark must be a string, got 5"),  # type: ignore[arg-type]
+    (
+        lambda s: torch_rollout(s, torch_state(s), torch.from_numpy(U).to_sparse()),
+        "u must be a CPU tensor of torch.float64, got sparse torch.float64",
+    ),
     (lambda s: s.step(np.zeros(5)), "u must have shape"),
     (lambda s: s.site_poses("a"), "q must be numeric"),
     (lambda s: s.marker_slice(np.zeros(2)), r"no pad ndarray of shape \(2,\)"),
@@ -205,6 +218,13 @@ def test_wrong_parameter(name: str, value: float, message: str, precision: Any) 
     values = torch.tensor([float(right), value], dtype=torch_state(sim).q.dtype)
     with pytest.raises(UsageError, match=match if np.isfinite(value) else f"^{name} is not finite"):
         torch_rollout(sim, torch_state(sim), torch.zeros((2, 2, 6), dtype=values.dtype), params={name: values})
+
+
+def test_interchanged_limits_of_a_joint_are_refused() -> None:
+    sim = Simulator(load_scene("pushing"))
+    sim.param("box_yaw.lower")[:], sim.param("box_yaw.upper")[:] = 1.0, -1.0
+    with pytest.raises(UsageError, match=r"parameter 'box_yaw\.lower' must be at most the upper limit, got 1"):
+        sim.step(np.zeros(6))
 
 
 @pytest.mark.parametrize("precision", ["double", "single"])

@@ -126,3 +126,18 @@ def test_wrong_shapes_and_scenes_without_sites_raise() -> None:
     wrong = _core.SiteDef(name="tip", body=99, pos=np.zeros(3), quat=[1, 0, 0, 0])
     with pytest.raises(ValueError, match="site 'tip' refers to body 99"):
         _core.site_poses(sim.model, [wrong], sim.params, sim.q)
+
+
+def test_wrong_states_and_parameters_are_refused() -> None:
+    sim = Simulator(with_sites("rolling"), num_envs=2)
+    q, first = sim.q.copy(), sim.joint_q("ball") + 3
+    q[1, 0] = np.nan
+    with pytest.raises(UsageError, match=re.escape("q[1, 0] is not finite")):
+        sim.site_poses(q)
+    q[1] = q[0]
+    q[1, first : first + 4] = 0
+    with pytest.raises(UsageError, match=r"the quaternion of joint 'ball'.* has length 0"):
+        torch_layer.torch_site_poses(sim, torch.from_numpy(q))
+    sim.param("ball.mass")[1] = np.nan
+    with pytest.raises(UsageError, match=r"environment 1: parameter 'ball\.mass' must be a number"):
+        sim.site_poses()

@@ -43,6 +43,12 @@ def test_every_scene_has_a_picture_that_is_not_blank(name: str) -> None:
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 200
 
 
+@pytest.mark.parametrize("size", [(64, 64), (65, 300), (300, 64)])
+def test_small_pictures(size: tuple[int, int]) -> None:
+    sim = gs.Simulator(gs.load_scene("insertion"))
+    assert gs.render(sim, size=size).shape == (size[1], size[0], 3)
+
+
 def test_contact_force_is_an_arrow_that_appears_with_the_contact() -> None:
     scene = gs.load_scene("pushing")
     sim = gs.Simulator(scene)

@@ -70,3 +70,23 @@ def test_wrong_environment_and_core_model_are_refused() -> None:
         scene_drawing(gs.Simulator(scene), 1)
     with pytest.raises(UsageError, match="core model cannot be drawn"):
         scene_drawing(gs.Simulator(scene.build()))
+
+
+def test_a_contact_of_a_larger_box_is_drawn_where_its_force_acts() -> None:
+    scene = gs.load_scene("pushing")
+    sim, box = gs.Simulator(scene), next(shape for shape in scene.shapes if shape.name == "box")
+    for axis, half in zip("xy", box.size[:2], strict=True):
+        sim.param(f"box.size.{axis}")[:] = 1.4 * half
+        sim.param(f"box.points.scale.{axis}")[:] = 1.4
+    sim.q[0, scene.q("box_x").start] += 0.4 * box.size[0]
+    push = np.zeros(scene.nu)
+    push[scene.u("gripper_x")] = 1.0
+    sim.step(push, 60)
+    drawn = {contact.name: contact for contact in scene_drawing(sim).contacts}["pad_box"]
+    moment, force = np.split(sim.wrenches()[0, sim.model.contact_names.index("pad_box")], 2)
+    np.testing.assert_allclose(np.cross(drawn.point, force), moment, atol=1e-3 * float(np.linalg.norm(force)))
+
+
+def test_scenes_and_readings_are_compared_by_identity() -> None:
+    scene = gs.load_scene("rolling")
+    assert scene != gs.load_scene("rolling") and scene in {scene}

@@ -1,12 +1,14 @@
 """Gradients through PyTorch: over a hundred steps, step by step, and with respect to fitted parameters."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from gelflow.errors import UsageError
 from gelflow.sim import torch_layer
-from gelflow.sim.scene import FRICTION_LAWS
+from gelflow.sim.scene import FRICTION_LAWS, load_scene
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.validation import gradient_check
 from gelflow.sim.validation.contact_states import converged_simulator, scene_in_contact
@@ -162,3 +164,20 @@ def test_invalid_parameters_raise() -> None:
     ):
         with pytest.raises(UsageError, match=message):
             torch_layer.torch_rollout(sim, state, u, params={name: value})
+
+
+@pytest.mark.parametrize("length", [0.5, 1.0, 2.0])
+def test_gradient_by_a_quaternion_of_any_length(length: float) -> None:
+    """A step and the poses of sites normalize it."""
+    sim = Simulator(load_scene("rolling"))
+    state, u = torch_layer.torch_state(sim), torch.zeros((1, 3), dtype=torch.float64)
+    first, chosen = sim.joint_q("ball") + 3, torch.tensor([0.1, 0.2, 0.3, 0.4], dtype=torch.float64)
+
+    def orientation(quaternion: torch.Tensor) -> torch.Tensor:
+        q = torch.cat([state.q[:, :first], quaternion[None], state.q[:, first + 4 :]], 1)
+        return (torch_layer.torch_step(sim, replace(state, q=q), u)[0].q[0, first : first + 4] * chosen).sum()
+
+    start = (length * torch.tensor([0.8, 0.6, 0.0, 0.0], dtype=torch.float64)).requires_grad_()
+    (gradient,) = torch.autograd.grad(orientation(start), start)
+    differences = [orientation(start.detach() + d) - orientation(start.detach() - d) for d in 1e-6 * torch.eye(4)]
+    np.testing.assert_allclose(gradient, torch.stack(differences) / 2e-6, atol=1e-8)

@@ -203,3 +203,20 @@ def test_model_file_is_a_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert "robot" in capsys.readouterr().out
     with pytest.raises(UsageError, match="no such model file"):
         load_scene(tmp_path / "missing.urdf")
+
+
+@pytest.mark.parametrize(
+    ("kind", "limit", "message"),
+    [
+        ("revolute", 'lower="nan" upper="1"', "joint 'jb': lower limit nan must be below upper limit 1"),
+        ("revolute", 'lower="-1" upper="1" effort="-3"', "joint 'jb': the effort of <limit> must not be negative"),
+        ("floating", 'lower="-1" upper="1"', "joint 'jb' is floating, so its parent must be called 'world', got 'a'"),
+    ],
+)
+def test_limits_and_joints_that_cannot_be_simulated(kind: str, limit: str, message: str, tmp_path: Path) -> None:
+    path = robot(tmp_path / "arm.urdf")
+    before, after = path.read_text().split('<joint name="jb" type="revolute">')
+    after = after.replace('lower="-1" upper="1" effort="2"', limit)
+    path.write_text(f'{before}<joint name="jb" type="{kind}">{after}')
+    with pytest.raises(UsageError, match=message):
+        load_scene(path)

@@ -1,5 +1,6 @@
 """Randomization tables, and the sensor model whose levels they set."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -93,6 +94,22 @@ def test_bad_tables_are_named() -> None:
     for value in ("soft", (1.0, 2.0, 3.0), np.nan):
         with pytest.raises(UsageError, match="pad_mu: expected a number, a pair"):
             NOMINAL.replace(pad_mu=value)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Uniform("a", 1), "low must be a number, got 'a'"),  # type: ignore[arg-type]
+        (lambda: Normal("a", 1), "mean must be a number, got 'a'"),  # type: ignore[arg-type]
+        (lambda: Normal(0.08, -0.01), r"a normal distribution needs a finite mean and std ≥ 0, got \(0.08, -0.01\)"),
+        (lambda: Normal(np.nan, 0.01), "a normal distribution needs a finite mean"),
+        (lambda: Fixed("a"), "value must be a number, got 'a'"),  # type: ignore[arg-type]
+        (lambda: Fixed(np.inf), "a fixed value must be finite, got inf"),
+    ],
+)
+def test_impossible_distributions_are_refused(make: Callable[[], Any], message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        make()
 
 
 def test_rows_describe_the_table() -> None:

@@ -1,7 +1,7 @@
 """Batches of environments and their Gymnasium environments, on tasks without physics or with a single body."""
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,8 +14,10 @@ from numpy.typing import NDArray
 from gelflow.errors import SimulationError, UsageError
 from gelflow.sim import load_scene, make_task
 from gelflow.sim.tasks.control_task import ControlDescription, ControlTask, adapt_step
+from gelflow.sim.tasks.grasp import GraspTask
 from gelflow.sim.tasks.gripper.attempt_task import AttemptTask
 from gelflow.sim.tasks.gymnasium_envs import TaskEnv, TaskVectorEnv
+from gelflow.sim.tasks.pushing import PushingTask
 from gelflow.sim.tasks.randomization import Randomization
 from gelflow.sim.tasks.task_batch import Array, Mask, check_options, option_rows
 from gelflow.task import INSERTION, PUBLISHED_INSERTION, InsertionTask, TaskDescription
@@ -227,3 +229,24 @@ def test_no_environment_may_be_chosen(name: str) -> None:
     task.reset(none, rng)
     task.step(np.zeros((2, *task.action_space.shape)), rng, active=none)
     np.testing.assert_array_equal(task.observation, before)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: GraspTask(attempts=0), "sensors must be 2 and attempts at least 1, got 2 and 0"),
+        (lambda: GraspTask(sensors=1), "sensors must be 2 and attempts at least 1, got 1 and 10"),
+        (lambda: GraspTask(close_time=-1), "close_time, lift_time and hold_time must not be negative"),
+        (lambda: GraspTask(grid=3), "grid must be a Grid, got 3"),  # type: ignore[arg-type]
+        (lambda: PushingTask(control_period=0), "control_period must be positive and max_steps at least 1, got 0 and"),
+        (lambda: PushingTask(max_steps=0), "control_period must be positive and max_steps at least 1"),
+        (lambda: PushingTask(max_steps=1.5), "max_steps must be an integer, got 1.5"),  # type: ignore[arg-type]
+        (lambda: PushingTask(control_period=np.nan), "control_period must be a finite number, got nan"),
+        (lambda: PushingTask(goal_x=("a", 1)), "goal_x must be a tuple of finite numbers, got"),  # type: ignore[arg-type]
+        (lambda: InsertionTask(descent=np.inf), "descent must be a finite number, got inf"),
+        (lambda: make_task("grasp", 2, blocks="7"), "blocks must be an integer, got '7'"),
+    ],
+)
+def test_impossible_descriptions_are_refused(make: Callable[[], Any], message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        make()

@@ -5,7 +5,8 @@
 #include <limits>
 #include <mutex>
 
-#include "tracker.hpp"
+#include "../tracker.hpp"
+#include "interpreter_lock.hpp"
 
 namespace py = pybind11;
 using namespace gelflow::perception;
@@ -120,7 +121,7 @@ StartResult start(SharedTracker& shared, const Image& image) {
   StartResult out{py::array_t<double>({n, py::ssize_t(2)}), py::array_t<double>(n), py::array_t<double>(n)};
   auto position = out.position.mutable_unchecked<2>();
   auto contrast = out.contrast.mutable_unchecked<1>(), quality = out.quality.mutable_unchecked<1>();
-  py::gil_scoped_release release;
+  const WithoutInterpreterLock released;
   const std::lock_guard lock(shared.mutex);
   shared.tracker.start(pixels);
   for (py::ssize_t m = 0; m < n; ++m) {
@@ -152,7 +153,7 @@ TrackResult next_image(SharedTracker& shared, Step step) {
   auto quality = out.quality.mutable_unchecked<1>();
   auto valid = out.valid.mutable_unchecked<1>(), inferred = out.inferred.mutable_unchecked<1>();
   {
-    py::gil_scoped_release release;
+    const WithoutInterpreterLock released;
     const std::lock_guard lock(shared.mutex);
     Tracker& tracker = shared.tracker;
     step(tracker);
