@@ -56,9 +56,10 @@ class MockRobotConfig:
     rotations: tuple[Rotation, Rotation] = (0, 0)  # of the left and right images, clockwise [°]: 0, 90, 180 or 270
 
     def __post_init__(self) -> None:
-        for name in ("egm_port", "tcp_port", "truth_port"):
-            if not 0 <= getattr(self, name) <= 65535:
-                raise UsageError(f"{name.replace('_', ' ')} must be within 0 to 65535, got {getattr(self, name)}")
+        for name, lowest in (("egm_port", 1), ("tcp_port", 0), ("truth_port", 0)):
+            if not lowest <= getattr(self, name) <= 65535:
+                given = f"{name.replace('_', ' ')} must be within {lowest} to 65535, got {getattr(self, name)}"
+                raise UsageError(given)
 
     def view(self, finger: int) -> tuple[GelAppearance, Lens]:
         """Appearance of a gel in its camera's ideal image, and the camera's lens; finger 0 is the left one."""

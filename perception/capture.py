@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from gelflow.clock import Clock
 from gelflow.errors import PeerError, PeerTimeout
+from gelflow.perception.errors import name_for_opencv
 
 Image = NDArray[np.uint8]
 
@@ -136,12 +137,12 @@ class Capture:
                 self._check_reachable()
                 limit = int(self.timeout * 1000)
                 options = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, limit, cv2.CAP_PROP_READ_TIMEOUT_MSEC, limit]
-                capture = cv2.VideoCapture(self.text, cv2.CAP_FFMPEG, options)
+                capture = cv2.VideoCapture(name_for_opencv(self.text), cv2.CAP_FFMPEG, options)
                 advice = f"no video stream within {self.timeout:g} s; check address and port"
             else:
                 self._check_not_text()
                 # FFmpeg takes the text before a colon in a relative path for a protocol.
-                capture = cv2.VideoCapture(str(Path(self.text).absolute()), cv2.CAP_FFMPEG)
+                capture = cv2.VideoCapture(name_for_opencv(Path(self.text).absolute()), cv2.CAP_FFMPEG)
                 advice = "not an image or a video that OpenCV can read"
         finally:
             cv2.utils.logging.setLogLevel(level)

@@ -1,10 +1,12 @@
-"""The error of a first image that cannot be the reference, with a picture of the detected dots."""
+"""Errors of images: a first image that cannot be the reference, and a file name that OpenCV cannot use."""
+
+from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gelflow.errors import PeerError
+from gelflow.errors import PeerError, UsageError
 
 _DOT = (0, 255, 255)
 _LINE = (255, 180, 0)
@@ -39,3 +41,13 @@ def draw_detections(
     for right, down in fixed.tolist():
         cv2.circle(picture, (right, down), round((radius + 1) * 2**_SHIFT), _DOT, 1, cv2.LINE_AA, _SHIFT)
     return picture
+
+
+def name_for_opencv(path: Path | str) -> str:
+    """The name of a file for OpenCV. Raises UsageError where it is not UTF-8: OpenCV would end the process."""
+    name = str(path)
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        raise UsageError(f"the file name {name!r} is not valid UTF-8: rename the file") from None
+    return name

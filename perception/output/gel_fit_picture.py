@@ -3,9 +3,12 @@
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gelflow.figures import BLUE, VERMILION, save
 from gelflow.perception.force.gel_fit import ForceSamples, GelFit
+
+Array = NDArray[np.float64]
 
 
 def draw_gel_fit(samples: ForceSamples, fit: GelFit, scale: float, path: Path) -> None:
@@ -27,7 +30,7 @@ def draw_gel_fit(samples: ForceSamples, fit: GelFit, scale: float, path: Path) -
         fitted = scale * estimated
         largest = max(largest, float(np.nanmax(measured)), float(fitted[np.isfinite(measured)].max()))
         left.plot(measured, fitted, ".", color=colour, markersize=4, label=name)
-        right.plot(samples.stamp, measured, "-", color="black", linewidth=0.8)
+        right.plot(*_with_gaps(samples, measured), "-", color="black", linewidth=0.8)
         right.plot(samples.stamp, fitted, ".", color=colour, markersize=4, label=f"{name}, from markers")
     left.plot([0, largest], [0, largest], color="black", linewidth=0.8, label="measured")
     left.set(xlabel="measured force [N]", ylabel="force from markers, fitted gel [N]", title="all images with contact")
@@ -38,3 +41,9 @@ def draw_gel_fit(samples: ForceSamples, fit: GelFit, scale: float, path: Path) -
         axes.grid(alpha=0.3)
         axes.legend(fontsize=8)
     save(figure, path, dpi=110)
+
+
+def _with_gaps(samples: ForceSamples, force: Array) -> tuple[Array, Array]:
+    """Times and forces with a NaN between two contacts, so that no line joins them."""
+    ends = np.flatnonzero(np.diff(samples.contact)) + 1
+    return np.insert(samples.stamp, ends, samples.stamp[ends]), np.insert(force, ends, np.nan)

@@ -22,7 +22,9 @@ def picture_of_init_error(beside: Path) -> Iterator[None]:
     except TrackerInitError as error:
         file = _new_file(beside)
         note = f"the picture {file} shows the detected dots"
-        if not cv2.imwrite(str(file), error.picture):
+        try:
+            file.write_bytes(cv2.imencode(".png", error.picture)[1].tobytes())
+        except OSError:
             note = f"the picture of the detected dots, {file}, cannot be written"
         raise PeerError(f"{error}; {note}") from None
 

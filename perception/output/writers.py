@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import PeerError, UsageError
+from gelflow.perception.errors import name_for_opencv
 from gelflow.perception.force.estimator import ForceEstimate
 from gelflow.perception.force.image_forces import force_record
 from gelflow.perception.force.slip import SlipEstimate
@@ -163,9 +164,10 @@ class OverlayWriter:
         self._last: TrackedImage | None = None
         self._video: cv2.VideoWriter | None = None
         self._written = 0  # pictures of the video
-        try:  # before the images are tracked
+        if path.suffix.lower() not in PICTURE_SUFFIXES:
+            name_for_opencv(path)
+        try:  # before the images are tracked; from then on no other process can take the name
             path.open("xb").close()
-            path.unlink()
         except OSError as error:
             raise UsageError(f"cannot create {path}: {error.strerror}") from None
 
@@ -180,8 +182,8 @@ class OverlayWriter:
                 self._begin()
 
     def close(self) -> None:
-        if self._last is not None and not cv2.imwrite(str(self._path), self._draw(self._last)):
-            raise UsageError(f"cannot write {self._path}")
+        if self._last is not None:
+            self._path.write_bytes(cv2.imencode(self._path.suffix, self._draw(self._last))[1].tobytes())
         if self._waiting:
             self._begin()
         if self._video is not None:

@@ -17,6 +17,7 @@ from gelflow.perception.synthetic.sequences import GelSequence
 
 FORMAT = 1
 TRUTH = "truth.npz"  # ground truth of a folder; that of a video has the name of the video
+_OTHER_FILES = (".mp4", ".avi", ".mkv", ".mov", ".gif", ".png", ".jpg", ".jpeg")
 VIDEO = ".mjpeg"  # concatenated JPEG images, readable by video players and FFmpeg
 
 
@@ -44,6 +45,8 @@ def write_sequence(sequence: GelSequence, out: Path) -> Iterator[int]:
     deleted.
     """
     video = out.suffix == VIDEO
+    if not video and out.suffix.lower() in _OTHER_FILES:
+        raise UsageError(f"{out}: give a folder, or a video with the suffix {VIDEO}")
     if truth_file(out).exists() or (out.exists() and not (out.is_dir() and not any(out.iterdir()))):
         raise UsageError(f"{out} exists and would be overwritten: choose a new name or delete it")
     position, visible = [], []
@@ -51,7 +54,7 @@ def write_sequence(sequence: GelSequence, out: Path) -> Iterator[int]:
         (out.parent if video else out).mkdir(parents=True, exist_ok=True)
         for number, frame in enumerate(sequence):
             file = out if video else out / f"{number:06d}.jpg"
-            with file.open("ab") as images:
+            with file.open("ab" if video and number else "xb") as images:
                 images.write(frame.jpeg)
             position.append(frame.position)
             visible.append(frame.visible)
@@ -66,6 +69,8 @@ def write_sequence(sequence: GelSequence, out: Path) -> Iterator[int]:
             spacing_px=sequence.appearance.spacing,
             made_from=json.dumps(dataclasses.asdict(sequence)),
         )
+    except FileExistsError:  # since the check above
+        raise UsageError(f"{out} exists and would be overwritten: another process writes it") from None
     except OSError as error:
         written = [out] if video else [out / f"{number:06d}.jpg" for number in range(len(position) + 1)]
         with contextlib.suppress(OSError):

@@ -79,7 +79,7 @@ def read_randomization(path: Path, task: InsertionTask) -> dict[str, Any]:
     is no such report, has another format, or its recordings determine nothing.
     """
     try:
-        report: Any = json.loads(path.read_text())
+        report: Any = json.loads(path.read_text("utf-8"))
         number = report["format"]
         if number == FORMAT:
             part, found = report["part"], report["randomization"]

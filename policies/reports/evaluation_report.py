@@ -22,6 +22,8 @@ from gelflow.sim.tasks.gripper.flow_map_noise import FlowMapNoise
 from gelflow.sim.tasks.task_batch import TaskBatch
 
 RESULTS, EPISODES, FAILURES, FAILURE_PICTURE = "results.json", "episodes.csv", "failures.csv", "failures.png"
+_FILMS = (f"{name}.{suffix}" for name in ("success", "failure") for suffix in ("gif", "png"))
+_FILES = (RESULTS, EPISODES, FAILURES, FAILURE_PICTURE, *_FILMS)
 FORMAT = 1  # of results.json
 _MAX_FRAMES = 200  # of a film
 _LAST_FRAME = 2000  # [ms]
@@ -34,6 +36,7 @@ class Report:
     results: list[EvaluationResult] = field(default_factory=list)
     failures: list[FailureRange] = field(default_factory=list)
     files: list[Path] = field(default_factory=list)
+    error: Exception | None = None  # that ended the writing of the files
 
     def worst_ranges(self) -> list[str]:
         """A line for each of the quantities on which failures depend most."""
@@ -71,10 +74,12 @@ def evaluate_all(
 
     With `out`, writes results, episodes and failures as tables, a picture of the failures, and a film and the last
     picture of one success and one failure into this folder. `started` is called with the name of each evaluation.
-    Raises UsageError when the folder cannot be written.
+    Raises UsageError when the folder cannot be written, or has files of these names that are not of an evaluation. An
+    error of a later write is in the report, so that the results are not lost.
     """
     if out is not None:
         create_folder(out)
+        _check_replaceable(out)
     report = Report()
     for name, actor in actors(network, task, seed=seed).items():
         started(name)
@@ -85,10 +90,13 @@ def evaluate_all(
     report.failures = failure_ranges(own)
     if out is None:
         return report
-    _remove_files(out)
-    report.files += _write_tables(out, own, report)
-    started("films of a success and a failure")
-    report.files += _write_films(out, own, network, task, seed=seed)
+    try:
+        _remove_files(out)
+        report.files += _write_tables(out, own, report)
+        started("films of a success and a failure")
+        report.files += _write_films(out, own, network, task, seed=seed)
+    except (OSError, UsageError) as error:
+        report.error = error
     return report
 
 
@@ -122,15 +130,27 @@ def has_oracle(task: TaskBatch) -> bool:
     return True
 
 
+def _check_replaceable(out: Path) -> None:
+    """Raises UsageError when the folder has a file of a report, but not the results of an evaluation."""
+    present = [name for name in _FILES if (out / name).exists()]
+    if not present:
+        return
+    try:
+        is_evaluation = isinstance(json.loads((out / RESULTS).read_text("utf-8"))["results"], list)
+    except (OSError, ValueError, KeyError, TypeError):
+        is_evaluation = False
+    if not is_evaluation:
+        raise UsageError(f"{out / present[0]} would be replaced, and is not of an evaluation: choose another folder")
+
+
 def _remove_files(out: Path) -> None:
     """Removes the files of an earlier report; the new one need not have a failure, or a success."""
-    films = (f"{name}.{suffix}" for name in ("success", "failure") for suffix in ("gif", "png"))
-    for name in (RESULTS, EPISODES, FAILURES, FAILURE_PICTURE, *films):
+    for name in _FILES:
         (out / name).unlink(missing_ok=True)
 
 
 def _write_tables(out: Path, episodes: Episodes, report: Report) -> list[Path]:
-    with (out / EPISODES).open("w", newline="") as file:
+    with (out / EPISODES).open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         names = [_with_unit(name, episodes.quantity_units[name]) for name in episodes.quantities]
         writer.writerow(["success", "failed", episodes.length_unit, "return", *episodes.metrics, *names])
@@ -139,10 +159,10 @@ def _write_tables(out: Path, episodes: Episodes, report: Report) -> list[Path]:
         writer.writerows(zip(*(column.tolist() for column in columns), strict=True))
     rows = [entry.to_json() for entry in report.failures]
     values = {"format": FORMAT, "results": [result.to_json() for result in report.results], "failures": rows}
-    (out / RESULTS).write_text(json.dumps(to_plain(values), indent=2) + "\n")
+    (out / RESULTS).write_text(json.dumps(to_plain(values), indent=2) + "\n", "utf-8")
     if not rows:
         return [out / RESULTS, out / EPISODES]
-    with (out / FAILURES).open("w", newline="") as file:
+    with (out / FAILURES).open("w", newline="", encoding="utf-8") as file:
         table = csv.DictWriter(file, list(rows[0]))
         table.writeheader()
         table.writerows(rows)

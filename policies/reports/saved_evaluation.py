@@ -69,7 +69,7 @@ def is_evaluation(folder: Path) -> bool:
 
 def _read_results(path: Path) -> dict[str, Any]:
     """The contents of `results.json`. Raises UsageError when it has a newer format."""
-    values = dict(json.loads(path.read_text()))
+    values = dict(json.loads(path.read_text("utf-8")))
     version = values.get("format", 1)  # the first version wrote no number
     if version > FORMAT:
         raise UsageError(f"{path} has format {version}; this gelflow reads format {FORMAT}: update gelflow")

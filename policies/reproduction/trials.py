@@ -186,7 +186,7 @@ def _read(path: Path) -> dict[str, Any] | None:
     if not path.exists():
         return None
     try:
-        return dict(json.loads(path.read_text()))
+        return dict(json.loads(path.read_text("utf-8")))
     except (OSError, ValueError) as error:
         raise UsageError(f"{path} is damaged ({type(error).__name__}); delete it to evaluate again") from error
 

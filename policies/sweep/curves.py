@@ -96,6 +96,8 @@ def draw(path: Path, curves: Curves, task: str) -> None:
         every = max(1, len(curve.x) // 10)
         label = ", ".join(f"{key} {value}" for key, value in curve.values.items()) or "all seeds"
         axes.plot(curve.x, curve.median, style, color=color, marker=marker, markevery=every, markersize=4, label=label)
+        if len(curve.x) == 1:
+            axes.vlines(curve.x, curve.low, curve.high, color=color, alpha=0.4)
         axes.fill_between(curve.x, curve.low, curve.high, color=color, alpha=0.18, linewidth=0)
     axes.set(xlabel=f"{curves.x_name} [-]", ylabel=f"{curves.y_name} [-]", title=f"{task}: {curves.y_name}")
     seeds = sorted({curve.seeds for curve in curves.curves})

@@ -14,6 +14,7 @@ from gelflow.policies.sweep.engines.engine import Engine
 from gelflow.policies.sweep.run import Run, RunRecord, read_record, write_record
 from gelflow.policies.training.folder import try_lock
 
+GRID = "grid.toml"  # copy of the grid file in the folder of a sweep
 Report = Callable[[Run, RunRecord, bool], None]  # a run that ended, its record, and whether it is started again
 
 
@@ -41,8 +42,17 @@ def sweep_folder(folder: Path) -> Iterator[None]:
 
 def store_grid_file(folder: Path, grid_file: Path) -> None:
     """Copy the grid file into the folder of its sweep."""
-    if grid_file.resolve() != (folder / "grid.toml").resolve():
-        shutil.copyfile(grid_file, folder / "grid.toml")
+    if grid_file.resolve() != (folder / GRID).resolve():
+        shutil.copyfile(grid_file, folder / GRID)
+
+
+def check_grid_file(folder: Path, grid_file: Path, runs: Sequence[Run]) -> None:
+    """Raises UsageError where storing the grid would replace another file, in a folder without any of the runs."""
+    stored = folder / GRID
+    if not stored.exists() or stored.read_bytes() == grid_file.read_bytes():
+        return
+    if not any(run.record.exists() for run in runs):
+        raise UsageError(f"{stored} is not of these runs; choose another folder or delete it")
 
 
 def incomplete(runs: Sequence[Run]) -> list[Run]:

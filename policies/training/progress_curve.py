@@ -34,17 +34,22 @@ def figure_of(table: Path, *, title: str) -> Any:
     top, bottom = figure.subplots(2, 1, sharex=True)
     if "success" in curve:
         rated = np.isfinite(curve["success"])  # the line goes on over rows without a rate
-        top.plot(steps[rated], 100 * curve["success"][rated], "--", color="0.45", label="training, with exploration")
+        style = "--" if rated.sum() > 1 else "."  # a line of one point is invisible
+        top.plot(steps[rated], 100 * curve["success"][rated], style, color="0.45", label="training, with exploration")
     done = np.isfinite(curve["evaluated_success"])
     x, success = steps[done], 100 * curve["evaluated_success"][done]
     top.plot(x, success, "o-", color=BLUE, label="evaluation, 95 % confidence interval")
     low, high = 100 * curve["success_low"][done], 100 * curve["success_high"][done]
+    if len(x) == 1:
+        top.vlines(x, low, high, color=BLUE)
     top.fill_between(x, low, high, color=BLUE, alpha=0.2, linewidth=0)
     result = f": success {success[-1]:.1f} % after {x[-1]:.1f} thousand steps" if done.any() else ""
     top.set(ylabel="success [%]", ylim=(0, 102), title=title + result)
     top.legend(loc="lower right")
     if "reward" in curve:
-        bottom.plot(steps, curve["reward"], "--", color="0.45", label="training, mean of a step")
+        bottom.plot(
+            steps, curve["reward"], "--" if len(steps) > 1 else ".", color="0.45", label="training, mean of a step"
+        )
     bottom.plot(x, curve["evaluated_reward"][done], "o-", color=VERMILION, label="evaluation, mean of an episode")
     bottom.set(xlabel="environment steps [thousands]", ylabel="reward [-]")
     bottom.legend(loc="lower right")

@@ -27,7 +27,7 @@ class ProgressLog:
         writer.writeheader()
         writer.writerows(kept)
         replace_file(folder / TABLE, table.getvalue().encode())  # as a whole: a full disk must not empty the table
-        self._file = (folder / TABLE).open("a", newline="")
+        self._file = (folder / TABLE).open("a", newline="", encoding="utf-8")
         self._writer = csv.DictWriter(self._file, self._columns, restval="")
         self._board = _tensorboard(folder / LOGS, steps)
 

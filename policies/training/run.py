@@ -208,6 +208,8 @@ class TrainingRun:
         stored = read_configuration(self.folder) if (self.folder / CONFIGURATION).exists() else None
         if stored["finished"] if stored else self.checkpoint.exists():  # a policy of another origin is kept, too
             raise UsageError(f"{self.folder} already holds a trained policy; choose another folder or delete it")
+        if not stored and (self.folder / PROGRESS).exists():
+            raise UsageError(f"{self.folder / PROGRESS} is not of a run; choose another folder or delete it")
         if stored:
             self._check_same(stored)
         else:
@@ -276,7 +278,7 @@ def read_configuration(folder: Path) -> dict[str, Any]:
     """The contents of `run.json`. Raises UsageError when it is missing, damaged or newer."""
     path = folder / CONFIGURATION
     try:
-        stored = json.loads(path.read_text())
+        stored = json.loads(path.read_text("utf-8"))
         version = stored["format"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UsageError(f"{path} is not the configuration of a run ({type(error).__name__})") from error

@@ -62,11 +62,11 @@ def _camera(cell: Cell, sensor: int, mount: CameraMount) -> str:
     if sensor > 0:
         _check_distinct(cell)
     image = cell.cameras[sensor].latest()
+    age = cell.clock.now() - image.stamp  # before the search for markers, which takes a second
     picture = decode_image(image.data)
     if mount.calibration is not None:
         mount.calibration.check_size(picture)
     tracked = start_at_rest(mount, picture)
-    age = cell.clock.now() - image.stamp
     return f"{visible_text(mount, tracked)}; newest image {1e3 * age:.0f} ms old"
 
 

@@ -28,6 +28,7 @@ _SHAPE_KEYS: Mapping[str, tuple[str, ...]] = {
     "hemisphere": ("radius", "count"),
     "points": ("positions", "normals", "x_axes", "file"),
 }
+_LARGEST = 1e6  # size, radius or pitch of a pad [m]
 _RENAMED_KEYS = {"pushes": "collides"}
 
 
@@ -138,7 +139,7 @@ def _markers(table: TomlTable, shape: str, folder: Path) -> _Markers:
         return _planar_markers(grid.positions() * 1e-3, (grid.pitch * 1e-3) ** 2, grid)
     if shape == "points":
         return _Markers(*read_marker_list(table, folder), area=None, grid=None)
-    radius, count = table.number("radius", minimum=1e-9), table.integer("count")
+    radius, count = table.number("radius", minimum=1e-9, maximum=_LARGEST), table.integer("count")
     check_count(table.location, count)
     if shape == "disc":
         positions = disc_lattice(radius, count) + table.numbers("center", 2, (0.0, 0.0))
@@ -160,11 +161,11 @@ def _grid(table: TomlTable) -> Grid:
     if ("pitch" in table.data) == ("size" in table.data):
         raise UsageError(f"{table.location}: give either pitch (distance of markers) or size (area of the markers)")
     if "pitch" in table.data:
-        pitch = table.number("pitch", minimum=1e-9)
+        pitch = table.number("pitch", minimum=1e-9, maximum=_LARGEST)
     else:
         size = table.numbers("size", 2)
-        if min(size) <= 0:
-            raise UsageError(f"{table.location}: size must be two positive numbers, got {list(size)}")
+        if min(size) <= 0 or max(size) > _LARGEST:
+            raise UsageError(f"{table.location}: size must be two positive numbers ≤ {_LARGEST:g}, got {list(size)}")
         pitch = size[0] / rows
         if not np.isclose(pitch, size[1] / cols):
             raise UsageError(

@@ -112,11 +112,14 @@ class TomlTable:
         group = self.table(key)
         return {name: group.table(name) for name in group.data}
 
-    def number(self, key: str, default: float | None = None, *, minimum: float = -math.inf) -> float:
-        """A finite number ≥ `minimum`. A key without a default is required; this holds for all methods below."""
+    def number(
+        self, key: str, default: float | None = None, *, minimum: float = -math.inf, maximum: float = math.inf
+    ) -> float:
+        """A finite number within bounds. A key without a default is required; this holds for all methods below."""
         value = self._get(key, default)
-        if not _is_finite(value) or value < minimum:
+        if not _is_finite(value) or not minimum <= value <= maximum:
             bound = "" if minimum == -math.inf else f" ≥ {minimum:g}"
+            bound += "" if maximum == math.inf else f" ≤ {maximum:g}"
             raise UsageError(f"{self.location}: {key} must be a finite number{bound}, got {value!r}")
         return float(value)
 

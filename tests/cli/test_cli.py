@@ -251,3 +251,17 @@ def test_import_and_version_load_no_third_party_package(code: str) -> None:
     program = f"import sys\ntry: exec({code!r})\nexcept SystemExit: pass\nprint(sorted({heavy!r} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "[]"
+
+
+def test_numbers_that_are_too_large_are_errors_of_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["describe", "pushing", "--repeats", str(10**11)]) == 2
+    assert "--repeats must be at most 2147483647, got 100000000000" in capsys.readouterr().err
+
+    def exhausted(args: object) -> int:
+        raise MemoryError
+
+    monkeypatch.setattr("gelflow.cli.commands.describe.run", exhausted)
+    assert main(["describe", "pushing"]) == 2
+    assert capsys.readouterr().err == "gelflow describe: not enough memory; give smaller numbers\n"

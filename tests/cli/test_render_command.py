@@ -10,7 +10,7 @@ from gelflow.cli.main import main
 from gelflow.errors import UsageError
 from gelflow.perception.sources import image_source
 from gelflow.perception.synthetic.appearance import make_appearance
-from gelflow.perception.synthetic.sequence_files import read_truth
+from gelflow.perception.synthetic.sequence_files import read_truth, write_sequence
 from gelflow.perception.synthetic.sequences import GelSequence
 
 
@@ -71,6 +71,25 @@ def test_existing_folders_are_not_overwritten(tmp_path: Path, capsys: pytest.Cap
     assert main(["render", "--out", str(tmp_path), "--frames", "1"]) == 2
     assert "exists and would be overwritten" in capsys.readouterr().err
     assert [file.name for file in tmp_path.iterdir()] == ["mine.txt"]
+
+
+@pytest.mark.parametrize("name", ["images", "images.mjpeg"])
+def test_two_processes_cannot_write_the_same_images(name: str, tmp_path: Path) -> None:
+    first, second = (
+        write_sequence(GelSequence(make_appearance("clean", markers=63, seed=seed), "press", frames=3), tmp_path / name)
+        for seed in (0, 1)
+    )
+    with pytest.raises(UsageError, match="exists and would be overwritten"):
+        for written, _ in zip(first, second, strict=True):
+            assert written == 1
+    assert list(first) == [2, 3]
+    assert len(read_truth(tmp_path / ("images.npz" if name.endswith("jpeg") else "images/truth.npz")).position) == 3
+
+
+def test_a_suffix_of_another_kind_of_file_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["render", "--out", str(tmp_path / "film.mp4"), "--frames", "1"]) == 2
+    assert "give a folder, or a video with the suffix .mjpeg" in capsys.readouterr().err
+    assert not (tmp_path / "film.mp4").exists()
 
 
 def test_files_of_a_newer_or_other_format_are_rejected(tmp_path: Path) -> None:

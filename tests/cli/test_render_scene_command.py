@@ -87,3 +87,13 @@ def test_an_error_while_drawing_leaves_the_earlier_film(tmp_path: Path) -> None:
     with pytest.raises(SimulationError):
         _write_film(film, pictures(), (64, 48), 25.0, "mp4v")
     assert film.read_bytes() == b"earlier" and [path.name for path in tmp_path.iterdir()] == ["film.mp4"]
+
+
+@pytest.mark.parametrize("name", ["empty.csv", "complex.npy"])
+def test_controls_without_real_numbers(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "empty.csv").touch()
+    np.save(tmp_path / "complex.npy", np.ones((3, 6), complex))
+    arguments = ["--controls", str(tmp_path / name), "--out", str(tmp_path / "p.png")]
+    assert main(["render-scene", "pushing", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert "--controls: " in error and error.count("\n") == 1

@@ -1,6 +1,7 @@
 """Recipes, the evaluation report, and the commands `gelflow train` and `gelflow eval` of tasks other than insertion."""
 
 import dataclasses
+import errno
 import json
 import re
 from pathlib import Path
@@ -188,6 +189,25 @@ def test_a_report_has_tables_and_videos(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(UsageError, match="cannot write into"):
         evaluate_all(network, task, episodes=1, seed=1, out=tmp_path / "file")
+
+
+def test_an_evaluation_replaces_only_files_of_an_evaluation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    task = PointTask(4)
+    architecture = MLP(observation_shape=(4,), actions=2, hidden=(8,))
+    network = architecture.network(task.description, TorchActor(architecture).tensors())
+    (tmp_path / "failure.gif").write_text("mine")
+    with pytest.raises(UsageError, match=r"failure\.gif would be replaced, and is not of an evaluation"):
+        evaluate_all(network, task, episodes=4, seed=1, out=tmp_path)
+    assert (tmp_path / "failure.gif").read_text() == "mine"
+    (tmp_path / "failure.gif").unlink()
+    assert evaluate_all(network, task, episodes=4, seed=1, out=tmp_path).error is None
+
+    def full(*arguments: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("gelflow.policies.reports.evaluation_report._write_tables", full)
+    report = evaluate_all(network, task, episodes=4, seed=1, out=tmp_path)
+    assert len(report.results) == 2 and isinstance(report.error, OSError)
 
 
 def test_films_show_the_evaluated_episodes() -> None:

@@ -76,6 +76,7 @@ def test_page_shows_the_evaluation(folder: Path) -> None:
 def test_a_report_without_failures_has_no_film_of_an_earlier_one(tmp_path: Path) -> None:
     for name in ("success.gif", "failure.gif", "failure.png", "of a user.gif"):
         (tmp_path / name).touch()
+    (tmp_path / "results.json").write_text('{"results": []}')
     arguments = ["--randomization", "nominal", "--preset", "fast", "--episodes", "2", "--envs", "2"]
     assert main(["eval", "insertion", *arguments, "--out", str(tmp_path)]) == 0
     assert {path.name for path in tmp_path.glob("*.gif")} == {"success.gif", "of a user.gif"}

@@ -114,6 +114,9 @@ def _run(arguments: Sequence[str], requested: str) -> int:
     except BrokenPipeError:  # the reader has closed the pipe, as in `gelflow … | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the flush at exit
         return NEGATIVE_RESULT
+    except MemoryError:
+        print(f"gelflow {args.command}: not enough memory; give smaller numbers", file=sys.stderr)
+        return ERROR
     except GelflowError as error:
         # Notes are later errors and hints; the error stays one line.
         text = "; ".join([str(error), *getattr(error, "__notes__", [])])

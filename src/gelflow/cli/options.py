@@ -12,6 +12,7 @@ from gelflow.part import CUBOID
 from gelflow.task import INSERTION, InsertionTask
 
 DEFAULT_RANDOMIZATION = "default"
+_LARGEST_INTEGER = 2**31 - 1  # of the core and of array sizes
 _PAGE_ADDRESS = {"port": 8080, "host": "127.0.0.1"}  # options of a page and their defaults
 
 
@@ -172,11 +173,13 @@ def picture_size(text: str) -> tuple[int, int]:
 
 
 def check_at_least(args: argparse.Namespace, **limits: int) -> None:
-    """Raise UsageError for the first option that is below its limit; options that were not given are skipped."""
+    """Raise UsageError for the first option below its limit or above 32 bits; those that were not given are skipped."""
     for name, limit in limits.items():
         value = getattr(args, name)
         if value is not None and not value >= limit:
             raise UsageError(f"--{name.replace('_', '-')} must be at least {limit}, got {value}")
+        if value is not None and value > _LARGEST_INTEGER:
+            raise UsageError(f"--{name.replace('_', '-')} must be at most {_LARGEST_INTEGER}, got {value}")
 
 
 def add_page_address(parser: argparse.ArgumentParser, *, of: str = "") -> None:

@@ -59,6 +59,14 @@ def test_a_refused_sweep_keeps_the_stored_grid_file(tmp_path: Path, capsys: pyte
     assert (out / "grid.toml").read_text() == GRID
 
 
+def test_a_grid_file_of_something_else_is_not_replaced(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "tiny.toml").write_text(GRID)
+    (tmp_path / "grid.toml").write_text("mine = 1\n")
+    assert main(["sweep", str(tmp_path / "tiny.toml"), "--out", str(tmp_path)]) == 2
+    assert "grid.toml is not of these runs; choose another folder or delete it" in capsys.readouterr().err
+    assert (tmp_path / "grid.toml").read_text() == "mine = 1\n"
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

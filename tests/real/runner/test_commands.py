@@ -57,6 +57,22 @@ def test_a_timeout_of_a_demo_that_is_faster_than_real_time_names_a_remedy(
     assert "delays of this computer" not in capsys.readouterr().err
 
 
+def test_a_run_whose_output_is_closed_says_so(
+    tmp_path: Path, checkpoint: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def closed(plan: RunPlan) -> None:
+        if plan.on_preflight is not None:
+            plan.on_preflight([])
+        raise BrokenPipeError
+
+    monkeypatch.setattr(run_plan, "run_insertions", closed)
+    with mock_robot(factor=FACTOR, seed=9) as (lab, _):
+        arguments = ["--lab", str(lab), "--checkpoint", str(checkpoint), "--out", str(tmp_path / "out")]
+        assert main(["run", "insertion", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert "standard output was closed, which stopped the run; raise the gripper with: gelflow robot jog" in error
+
+
 @pytest.mark.slow
 def test_demo_inserts_a_part_and_its_session_replays(
     tmp_path: Path, checkpoint: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch

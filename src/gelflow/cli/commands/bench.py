@@ -43,7 +43,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         + f". Default: all except {' and '.join(_LONG)}, quick",
     )
     add_quick(parser)
-    add_repeats(parser, "timed runs of each case; results are medians (15; quick: 5)")
+    add_repeats(parser, "timed runs of each case (15; quick: 5)")
     parser.add_argument("--markdown", action="store_true", help="print the tables as Markdown")
     parser.add_argument(
         "--paper-model", type=Path, metavar="FILE", help="tactile_pad.xml of the paper's simulator, if it is installed"
@@ -56,6 +56,7 @@ def run(args: argparse.Namespace) -> int:
     """Measure and print tables. A negative result: a timed run was too far from its converged reference."""
     from gelflow.measurement.machine import processor
     from gelflow.measurement.timing import QUICK_REPEATS, REPEATS, BenchmarkOptions
+    from gelflow.policies.checkpoint import replace_file
     from gelflow.policies.training.folder import create_folder
     from gelflow.toml_tables import suggestion
 
@@ -66,13 +67,16 @@ def run(args: argparse.Namespace) -> int:
     for name in args.what:
         if name not in MEASUREMENTS:
             raise UsageError(f"no measurement {name!r}; {suggestion(name, tuple(MEASUREMENTS))}")
+    names = list(dict.fromkeys(args.what)) or [name for name in MEASUREMENTS if name not in _LONG]
+    if args.paper_model is not None and not ("rolling" in names and args.paper_model.is_file()):
+        raise UsageError("--paper-model is for the measurement rolling and must be a file")
     if args.out is not None:
         create_folder(args.out)
     output = Output(args.json, width=WIDTH)
-    output.console.print(f"{processor()}. Medians of {repeats} repeats; the cases of a table run in turn.")
+    output.console.print(f"{processor()}. {repeats} repeats; the cases of a table run in turn.")
     reports: list[Report] = []
     pictures: list[Callable[[Path], None]] = []  # each writes a file into the folder
-    for name in list(dict.fromkeys(args.what)) or [name for name in MEASUREMENTS if name not in _LONG]:
+    for name in names:
         with _Bar() as bar:
             options = BenchmarkOptions(quick=quick, repeats=repeats, progress=bar)
             measured = _measure(name, options, args, pictures)
@@ -84,7 +88,7 @@ def run(args: argparse.Namespace) -> int:
     status = conclude(reports, output)
     if args.out is not None:
         file = args.out / "bench.json"
-        file.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+        replace_file(file, (json.dumps(record, indent=1) + "\n").encode())
         output.text(f"written: {file}")
         for draw in pictures:
             draw(args.out)

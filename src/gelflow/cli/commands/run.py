@@ -32,7 +32,7 @@ from gelflow.cli.options import (
 from gelflow.cli.output import Output
 from gelflow.cli.prompt import read_line
 from gelflow.cli.stop_hint import hint_after_stop
-from gelflow.errors import GelflowError, UsageError
+from gelflow.errors import GelflowError, PeerError, UsageError
 from gelflow.interrupts import interruptible
 from gelflow.protocols import Policy
 from gelflow.session.motion_plan import load_motion_plan
@@ -43,6 +43,8 @@ if TYPE_CHECKING:
     from gelflow.real.runner.motion_executor import MotionExecutor
     from gelflow.real.runner.preflight import PreflightItem
     from gelflow.real.runner.run_plan import RunPlan
+
+_CLOSED = "standard output was closed, which stopped the run"
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -107,10 +109,11 @@ def run(args: argparse.Namespace) -> int:
         try:
             plan = dataclasses.replace(plan, on_motion=motion_observer(view, at_once))
             results = run_insertions(dataclasses.replace(plan, on_preflight=on_preflight))
-        except GelflowError as error:
+        except (GelflowError, BrokenPipeError) as caught:
+            error = caught if isinstance(caught, GelflowError) else PeerError(_CLOSED)
             if hint := hint_after_stop(str(error), args.lab, moved=passed):
                 error.add_note(hint)
-            raise
+            raise error from None
     output.console.print(insertion_table(results))
     for line in warnings:
         output.text(f"warning: {line}")

@@ -73,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
 def show(measured: "Tradeoff", title: str, output: Output) -> None:
     """Print the tables and their explanation."""
     console = output.console
-    console.print(table(measured, title))
+    output.wide_table(table(measured, title))
     console.print(_EXPLANATION)
     console.print()
     console.print(dominated(measured))

@@ -1,6 +1,7 @@
 """`gelflow render-scene SCENE`: a picture or a film of a scene with bodies, contact forces and pads."""
 
 import argparse
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -93,7 +94,10 @@ def _controls(scene: "Scene", file: Path | None) -> NDArray[np.float64]:
         if file.suffix == ".npy":
             read = np.load(file, allow_pickle=False)
         else:
-            read = np.loadtxt(file, delimiter=",", ndmin=2, encoding="utf-8-sig")
+            with warnings.catch_warnings(category=UserWarning, action="ignore"):  # of an empty file
+                read = np.loadtxt(file, delimiter=",", ndmin=2, encoding="utf-8-sig")
+        if np.iscomplexobj(read):
+            raise ValueError("the numbers are complex")
         controls = np.asarray(read, dtype=np.float64)
     except (OSError, ValueError, TypeError) as error:
         raise UsageError(f"--controls: cannot read {file}: {' '.join(str(error).split())}") from None
@@ -122,8 +126,10 @@ def _write_film(path: Path, pictures: Any, size: tuple[int, int], fps: float, co
     """Write a film by way of a file beside it: an error while drawing leaves an earlier film as it is."""
     import cv2
 
+    from gelflow.perception.errors import name_for_opencv
     from gelflow.perception.output.writers import check_complete, video_rate
 
+    name_for_opencv(path)
     partial, count = path.with_name(f"{path.stem}.part{path.suffix}").absolute(), 0
     try:
         video = cv2.VideoWriter(str(partial), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*codec), video_rate(fps), size)
@@ -142,5 +148,4 @@ def _write_film(path: Path, pictures: Any, size: tuple[int, int], fps: float, co
 def _write_picture(path: Path, picture: NDArray[np.uint8]) -> None:
     import cv2
 
-    if not cv2.imwrite(str(path), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)):
-        raise UsageError(f"cannot write {path}")
+    path.write_bytes(cv2.imencode(path.suffix, cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))[1].tobytes())

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from gelflow.cli.exit_codes import SUCCESS
-from gelflow.cli.options import add_checkpoint, add_json, add_page_address, add_preset
+from gelflow.cli.options import add_checkpoint, add_json, add_page_address, add_preset, check_at_least
 from gelflow.cli.output import Output
 from gelflow.errors import UsageError
 from gelflow.session.decision_replay import Comparison
@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
     if sessions and (len(sessions) < len(args.shown) or len(sessions) > 2):
         raise UsageError(f"name one scene, or one session or two, got {' '.join(args.shown)}")
     if not sessions and len(args.shown) > 1:
-        raise UsageError(f"name one scene, got {' '.join(args.shown)}")
+        raise UsageError(f"name one scene or one run, got {' '.join(args.shown)}")
     folder = "" if sessions else _run_folder(args.shown[0])
     for name, default in _SCENE_ONLY.items():
         if sessions and getattr(args, name) != default:
@@ -88,8 +88,7 @@ def _view_run(args: argparse.Namespace) -> int:
 
 
 def _view_scene(args: argparse.Namespace) -> int:
-    if args.num_envs < 1:
-        raise UsageError(f"--num-envs must be at least 1, got {args.num_envs}")
+    check_at_least(args, num_envs=1)
     from gelflow.sim.scene import load_scene
     from gelflow.sim.simulator import Simulator
     from gelflow.view.simulation_page import SimulationPage

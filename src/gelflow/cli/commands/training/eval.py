@@ -70,12 +70,14 @@ def run(args: argparse.Namespace) -> int:
         output.result(
             {"task": args.task, "checkpoint": path, "results": rows, "failures": failures, "files": report.files}
         )
-        return SUCCESS
-    output.console.print(result_table(report.results, args.task, path, args.episodes))
+    else:
+        output.console.print(result_table(report.results, args.task, path, args.episodes))
     for line in report.worst_ranges():
         output.text(line)
     for file in report.files:
         output.text(f"wrote {file}")
+    if report.error is not None:
+        raise report.error
     return SUCCESS
 
 

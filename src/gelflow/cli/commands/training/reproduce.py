@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
             )
         records.append(record)
         files += [out / f"reproduce_{task}.json", out / f"reproduce_{task}.png"]
-        files[-2].write_text(json.dumps(to_plain(record), indent=1) + "\n")
+        files[-2].write_text(json.dumps(to_plain(record), indent=1) + "\n", "utf-8")
         picture.draw(record, files[-1])
         output.console.print(_table(record))
     for file in files:

@@ -56,13 +56,14 @@ def run(args: argparse.Namespace) -> int:
     """Execute the runs that are not complete, then write and print the results of all."""
     check_at_least(args, jobs=1, tries=1)
     from gelflow.policies.sweep.grid import read_grid
-    from gelflow.policies.sweep.sweep import execute_runs, incomplete, store_grid_file, sweep_folder
+    from gelflow.policies.sweep.sweep import check_grid_file, execute_runs, incomplete, store_grid_file, sweep_folder
 
     output = Output(args.json)
     grid = read_grid(args.grid, train_options())
     folder = (args.out or Path("runs") / args.grid.stem).resolve()
     runs = grid.runs(folder)
     with interruptible(), sweep_folder(folder):
+        check_grid_file(folder, args.grid, runs)
         remaining = incomplete(runs)
         output.text(f"{len(runs)} runs in {folder}, {len(runs) - len(remaining)} of them complete")
         if not remaining:
