@@ -173,12 +173,12 @@ def picture_size(text: str) -> tuple[int, int]:
 
 
 def check_at_least(args: argparse.Namespace, **limits: int) -> None:
-    """Raise UsageError for the first option below its limit or above 32 bits; those that were not given are skipped."""
+    """Raise UsageError for the first option below its limit, or above 32 bits except a seed; None is skipped."""
     for name, limit in limits.items():
         value = getattr(args, name)
         if value is not None and not value >= limit:
             raise UsageError(f"--{name.replace('_', '-')} must be at least {limit}, got {value}")
-        if value is not None and value > _LARGEST_INTEGER:
+        if value is not None and name != "seed" and value > _LARGEST_INTEGER:
             raise UsageError(f"--{name.replace('_', '-')} must be at most {_LARGEST_INTEGER}, got {value}")
 
 
