@@ -172,7 +172,7 @@ def _distance(sim: Simulator, env: int, shape: ShapeDef, points: Array) -> tuple
     """Distances (n,) and normals (n, 3) of a shape, with the size that an environment has, at points in its frame."""
     size = _vector(sim, env, "shape", f"{shape.name}.size")
     model = sim.model
-    if not np.array_equal(size, shape.size):
+    if not np.allclose(size, shape.size, rtol=1e-6, atol=0):  # up to single precision
         spec = _core.ModelSpec()
         # A model needs something that can move.
         body = spec.add_body(_core.BodyDef(name="body", mass=1.0, inertia=[1.0, 1.0, 1.0, 0.0, 0.0, 0.0]))

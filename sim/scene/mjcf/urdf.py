@@ -41,7 +41,7 @@ def read_urdf(path: Path) -> ElementTree.Element | None:
 
 
 def _check_floating(robot: ElementTree.Element, path: Path) -> None:
-    """Raises UsageError for a floating joint below another link than the world, which MuJoCo does not simulate."""
+    """Raises UsageError for a floating joint below another link than the world; MuJoCo has free joints only there."""
     for joint in robot.findall("joint"):
         parent = joint.find("parent")
         link = "" if parent is None else parent.get("link", "")
