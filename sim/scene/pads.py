@@ -164,8 +164,10 @@ def _grid(table: TomlTable) -> Grid:
         pitch = table.number("pitch", minimum=1e-9, maximum=_LARGEST)
     else:
         size = table.numbers("size", 2)
-        if min(size) <= 0 or max(size) > _LARGEST:
-            raise UsageError(f"{table.location}: size must be two positive numbers ≤ {_LARGEST:g}, got {list(size)}")
+        if min(size) <= 0:
+            raise UsageError(f"{table.location}: size must be two positive numbers, got {list(size)}")
+        if max(size) > _LARGEST:
+            raise UsageError(f"{table.location}: size must be at most {_LARGEST:g} m, got {list(size)}")
         pitch = size[0] / rows
         if not np.isclose(pitch, size[1] / cols):
             raise UsageError(
