@@ -54,6 +54,7 @@ def test_noisy_markers_are_those_of_all_insertions(world: RecordedWorld) -> None
     np.testing.assert_array_equal(part.used, recordings.used)
 
 
+@pytest.mark.slow
 def test_noisy_markers_do_not_count_and_are_reported(world: RecordedWorld) -> None:
     recordings = with_noise(world.recordings.of(np.array([0, 1])), 1e4)
     result = calibrate(recordings, settings=LITTLE)

@@ -77,6 +77,7 @@ def test_one_insertion_holds_nothing_out(world: RecordedWorld) -> None:
     assert result.held_out_residual is None and result.predicted is None
 
 
+@pytest.mark.slow
 def test_the_held_out_residual_tells_the_true_parameters_from_others(world: RecordedWorld) -> None:
     problem = Problem(world.recordings.of(np.array([4])), threads=1)
     truth = np.array([float(p.whitened(np.array(world.truth[p.name]))) for p in problem.fitted])
