@@ -25,7 +25,7 @@ BUILD_TOOLS := scikit-build-core pybind11 cmeel-eigen cmake ninja
 SETUP := .venv/.gelflow-setup
 WHEEL := build/wheel
 DOCS_SETUP := .venv/.gelflow-docs
-CXX_FILES = $(wildcard $(foreach folder,sim/csrc sim/csrc/* perception/csrc perception/csrc/*,$(folder)/*.cpp $(folder)/*.hpp))
+CXX_FILES = $(wildcard $(foreach folder,src/gelflow/csrc sim/csrc sim/csrc/* perception/csrc perception/csrc/*,$(folder)/*.cpp $(folder)/*.hpp))
 
 # The sanitizers' libraries come first in the process, and the C++ library, whose exceptions they watch.
 SANITIZE_BUILD := build/sanitize

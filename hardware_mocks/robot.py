@@ -58,8 +58,8 @@ class MockRobotConfig:
     def __post_init__(self) -> None:
         for name, lowest in (("egm_port", 1), ("tcp_port", 0), ("truth_port", 0)):
             if not lowest <= getattr(self, name) <= 65535:
-                given = f"{name.replace('_', ' ')} must be within {lowest} to 65535, got {getattr(self, name)}"
-                raise UsageError(given)
+                port, given = name.replace("_", " "), getattr(self, name)
+                raise UsageError(f"{port} must be within {lowest} to 65535, got {given}")
 
     def view(self, finger: int) -> tuple[GelAppearance, Lens]:
         """Appearance of a gel in its camera's ideal image, and the camera's lens; finger 0 is the left one."""

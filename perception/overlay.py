@@ -1,4 +1,7 @@
-"""Draws a tracking result over its image: markers, grid and displacements."""
+"""Draws a tracking result over its image: markers, grid and displacements; writes pictures."""
+
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -95,3 +98,11 @@ def _fixed(position: NDArray[np.float64]) -> tuple[int, int]:
     # OpenCV's coordinates are 32-bit integers.
     right, down = np.clip(position, -20000, 20000) * 2**_SHIFT
     return round(float(right)), round(float(down))
+
+
+def write_picture(path: Path, picture: NDArray[Any]) -> None:
+    """Write a picture (B G R) in the format of the suffix. Unlike `cv2.imwrite` it takes any file name.
+
+    Raises OSError when the file cannot be written.
+    """
+    path.write_bytes(cv2.imencode(path.suffix, picture)[1].tobytes())

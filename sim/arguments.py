@@ -1,6 +1,6 @@
 """Checks of the arguments of a simulator: every refusal is a UsageError in one line."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Container, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -73,6 +73,11 @@ def near_params(name: Any, params: Iterable[str]) -> list[str]:
     """For an error message: the parameters of the element that `name` names, or the names of all elements."""
     owner = str(name).split(".")[0]
     return [p for p in params if p.split(":")[-1].startswith(owner + ".")] or sorted({p.split(".")[0] for p in params})
+
+
+def qualified(name: str, params: Container[str], *kinds: str) -> str:
+    """The name in `params` of a parameter: with one of the kinds, where elements of several kinds have the name."""
+    return next((known for known in (f"{kind}:{name}" for kind in kinds) if known in params), name)
 
 
 def index_of(kind: str, name: Any, names: Sequence[str]) -> int:

@@ -5,10 +5,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import cv2
-
 from gelflow.errors import PeerError
 from gelflow.perception.errors import TrackerInitError
+from gelflow.perception.overlay import write_picture
 
 
 @contextmanager
@@ -23,7 +22,7 @@ def picture_of_init_error(beside: Path) -> Iterator[None]:
         file = _new_file(beside)
         note = f"the picture {file} shows the detected dots"
         try:
-            file.write_bytes(cv2.imencode(".png", error.picture)[1].tobytes())
+            write_picture(file, error.picture)
         except OSError:
             note = f"the picture of the detected dots, {file}, cannot be written"
         raise PeerError(f"{error}; {note}") from None

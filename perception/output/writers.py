@@ -21,7 +21,7 @@ from gelflow.perception.force.image_forces import force_record
 from gelflow.perception.force.slip import SlipEstimate
 from gelflow.perception.output.csv_file import CsvFile
 from gelflow.perception.output.forces import SUFFIX, ForceTable, draw_force
-from gelflow.perception.overlay import draw_overlay
+from gelflow.perception.overlay import draw_overlay, write_picture
 from gelflow.perception.sources import SourceImage, image_source
 from gelflow.perception.tracker import TrackingResult
 from gelflow.protocols import CameraImage
@@ -183,7 +183,7 @@ class OverlayWriter:
 
     def close(self) -> None:
         if self._last is not None:
-            self._path.write_bytes(cv2.imencode(self._path.suffix, self._draw(self._last))[1].tobytes())
+            write_picture(self._path, self._draw(self._last))
         if self._waiting:
             self._begin()
         if self._video is not None:

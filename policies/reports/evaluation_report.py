@@ -22,7 +22,7 @@ from gelflow.sim.tasks.gripper.flow_map_noise import FlowMapNoise
 from gelflow.sim.tasks.task_batch import TaskBatch
 
 RESULTS, EPISODES, FAILURES, FAILURE_PICTURE = "results.json", "episodes.csv", "failures.csv", "failures.png"
-_FILMS = (f"{name}.{suffix}" for name in ("success", "failure") for suffix in ("gif", "png"))
+_FILMS = ("success.gif", "success.png", "failure.gif", "failure.png")
 _FILES = (RESULTS, EPISODES, FAILURES, FAILURE_PICTURE, *_FILMS)
 FORMAT = 1  # of results.json
 _MAX_FRAMES = 200  # of a film

@@ -34,8 +34,7 @@ def figure_of(table: Path, *, title: str) -> Any:
     top, bottom = figure.subplots(2, 1, sharex=True)
     if "success" in curve:
         rated = np.isfinite(curve["success"])  # the line goes on over rows without a rate
-        style = "--" if rated.sum() > 1 else "."  # a line of one point is invisible
-        top.plot(steps[rated], 100 * curve["success"][rated], style, color="0.45", label="training, with exploration")
+        _plot_training(top, steps[rated], 100 * curve["success"][rated], "training, with exploration")
     done = np.isfinite(curve["evaluated_success"])
     x, success = steps[done], 100 * curve["evaluated_success"][done]
     top.plot(x, success, "o-", color=BLUE, label="evaluation, 95 % confidence interval")
@@ -47,12 +46,15 @@ def figure_of(table: Path, *, title: str) -> Any:
     top.set(ylabel="success [%]", ylim=(0, 102), title=title + result)
     top.legend(loc="lower right")
     if "reward" in curve:
-        bottom.plot(
-            steps, curve["reward"], "--" if len(steps) > 1 else ".", color="0.45", label="training, mean of a step"
-        )
+        _plot_training(bottom, steps, curve["reward"], "training, mean of a step")
     bottom.plot(x, curve["evaluated_reward"][done], "o-", color=VERMILION, label="evaluation, mean of an episode")
     bottom.set(xlabel="environment steps [thousands]", ylabel="reward [-]")
     bottom.legend(loc="lower right")
     for axes in (top, bottom):
         axes.grid(alpha=0.3)
     return figure
+
+
+def _plot_training(axes: Any, x: Array, y: Array, label: str) -> None:
+    """A dashed line, or a point where there is only one: a line would be invisible."""
+    axes.plot(x, y, "--" if len(x) > 1 else ".", color="0.45", label=label)

@@ -208,10 +208,10 @@ class TrainingRun:
         stored = read_configuration(self.folder) if (self.folder / CONFIGURATION).exists() else None
         if stored["finished"] if stored else self.checkpoint.exists():  # a policy of another origin is kept, too
             raise UsageError(f"{self.folder} already holds a trained policy; choose another folder or delete it")
-        if not stored and (self.folder / PROGRESS).exists():
-            raise UsageError(f"{self.folder / PROGRESS} is not of a run; choose another folder or delete it")
         if stored:
             self._check_same(stored)
+        elif (self.folder / PROGRESS).exists():
+            raise UsageError(f"{self.folder / PROGRESS} is not of a run; choose another folder or delete it")
         else:
             self._write_configuration(self._configuration(), finished=False)
         if (self.folder / STATE).exists():

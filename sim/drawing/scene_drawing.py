@@ -119,9 +119,7 @@ def _pose(sim: Simulator, env: int, kind: str, name: str, pose: Pose) -> Pose:
 
 def _vector(sim: Simulator, env: int, kind: str, name: str) -> Array:
     """Three parameters of an environment, with the endings x, y and z."""
-    names = [f"{name}.{axis}" for axis in "xyz"]
-    if f"{kind}:{names[0]}" in sim.param_index:  # where elements of different kinds have one name
-        names = [f"{kind}:{name}" for name in names]
+    names = [arguments.qualified(f"{name}.{axis}", sim.param_index, kind) for axis in "xyz"]
     return np.array([float(sim.param(name)[env]) for name in names])
 
 

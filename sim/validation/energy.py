@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from gelflow.errors import UsageError
 from gelflow.geometry import rotate
 from gelflow.sim import _core
-from gelflow.sim.arguments import check_type
+from gelflow.sim.arguments import check_type, qualified
 from gelflow.sim.scene import CONTACT_PARAMS, Scene
 from gelflow.sim.simulator import Simulator
 
@@ -90,8 +90,9 @@ class EnergyGauge:
         """
         probe, numbers = self._probe, set(CONTACT_PARAMS)
         for i, name in enumerate(probe.model.param_names):
-            if name.rsplit(".", 1)[-1] not in numbers and (same := _names(sim, name, "body", "joint", "shape")):
-                probe.params[:, i] = sim.param(same[0])
+            same = qualified(name, sim.param_index, "body", "joint", "shape")
+            if same in sim.param_index and name.rsplit(".", 1)[-1] not in numbers:
+                probe.params[:, i] = sim.param(same)
         for contact, (_, points) in self._contacts.items():
             for axis in "xyz":
                 for pose in ("pos", "turn"):
@@ -147,13 +148,9 @@ def actuator_forces(scene: Scene, sim: Simulator, u: ArrayLike) -> Array:
 
 def _number(sim: Simulator, contact: str, number: str) -> Array:
     """Parameter of a contact, (N,); contacts of colliding pads have those of the pad."""
-    own = _names(sim, f"{contact}.{number}", "contact")
-    return sim.param((own or _names(sim, f"{contact.split('/')[0]}.{number}", "pad"))[0])
-
-
-def _names(sim: Simulator, name: str, *kinds: str) -> list[str]:
-    """The names of a parameter that `sim` has: its own, or with its kind, where elements of several have one name."""
-    return [known for known in (name, *(f"{kind}:{name}" for kind in kinds)) if known in sim.param_index]
+    own = qualified(f"{contact}.{number}", sim.param_index, "contact")
+    of_pad = qualified(f"{contact.split('/')[0]}.{number}", sim.param_index, "pad")
+    return sim.param(own if own in sim.param_index else of_pad)
 
 
 def _gravity(sim: Simulator) -> Array:
@@ -183,7 +180,7 @@ def joint_energies(sim: Simulator, tendons: Sequence[_core.TendonDef] = ()) -> t
     springs, limits = np.zeros(sim.num_envs), np.zeros(sim.num_envs)
     for kind, name, value in values:
         stiffness, rest, lower, upper, limit_stiffness = (
-            sim.param(_names(sim, f"{name}.{key}", kind)[0])
+            sim.param(qualified(f"{name}.{key}", sim.param_index, kind))
             for key in ("stiffness", "springref", "lower", "upper", "limit_stiffness")
         )
         springs += 0.5 * stiffness * (value - rest) ** 2

@@ -5,10 +5,11 @@
 #include <mutex>
 #include <string>
 
-#include "../python/interpreter_lock.hpp"
 #include "contact_fit.hpp"
+#include "interpreter_lock.hpp"
 
 namespace py = pybind11;
+using gelflow::WithoutInterpreterLock;
 using namespace gelflow::perception;
 
 namespace {

@@ -3,9 +3,9 @@
 
 #include <optional>
 
+#include "interpreter_lock.hpp"
 #include "python/arrays.hpp"
 #include "python/bindings.hpp"
-#include "python/interpreter_lock.hpp"
 
 namespace gelflow {
 

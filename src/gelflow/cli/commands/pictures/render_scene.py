@@ -148,4 +148,6 @@ def _write_film(path: Path, pictures: Any, size: tuple[int, int], fps: float, co
 def _write_picture(path: Path, picture: NDArray[np.uint8]) -> None:
     import cv2
 
-    path.write_bytes(cv2.imencode(path.suffix, cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))[1].tobytes())
+    from gelflow.perception.overlay import write_picture
+
+    write_picture(path, cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))

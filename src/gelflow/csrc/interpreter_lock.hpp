@@ -1,4 +1,4 @@
-// Python's global interpreter lock.
+// Python's global interpreter lock, for all extensions.
 #pragma once
 
 #include <Python.h>
@@ -6,7 +6,7 @@
 #include <chrono>
 #include <thread>
 
-namespace gelflow::perception {
+namespace gelflow {
 
 // The interpreter's lock is released while an object of this class exists. Python ends a thread that wants the lock after
 // the interpreter has shut down: it unwinds the stack, which aborts the process at a destructor such as that of
@@ -28,4 +28,4 @@ class WithoutInterpreterLock {
   PyThreadState* thread_ = PyEval_SaveThread();
 };
 
-}  // namespace gelflow::perception
+}  // namespace gelflow

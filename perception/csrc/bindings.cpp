@@ -5,10 +5,11 @@
 #include <limits>
 #include <mutex>
 
-#include "../tracker.hpp"
 #include "interpreter_lock.hpp"
+#include "tracker.hpp"
 
 namespace py = pybind11;
+using gelflow::WithoutInterpreterLock;
 using namespace gelflow::perception;
 
 namespace {
