@@ -224,6 +224,7 @@ def _move(session: Session, devices: _Devices, motion: MotionExecutor, step: _St
     mounts = (lab.cameras.left.mount, lab.cameras.right.mount)
     observer = TactileObserver(devices.cameras, mounts, clock=session.clock, stale=lab.limits.stale_frame)
     observer.start(session.clock.now())
+    observer.at_rest(session.clock.now())  # the image period limits the speed
     guard = GuardedMotion(motion, observer, lab, session.clock, recorder)
     motion.expect_part(True)
     phases = motion.supervisor.phases

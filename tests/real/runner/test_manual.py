@@ -101,6 +101,7 @@ def test_a_stopped_run_is_cleared_by_jog_open_and_home(robot: MockRobot, tmp_pat
     down = 1e3 * (status["arm"]["height"] - 25.3e-3)  # 0.3 mm above the rim
     code, _ = operator.run("jog", "z", f"-{down:.2f}", "--yes")
     assert code == 0, operator.errors
+    assert dict(events(operator.session))["move"]["speed"] > 0.3e-3  # the images show how often they come
     before = height(robot)
     code, printed = operator.run("jog", "x", "2", answers="n\n")
     assert code == 1 and "raise the gripper to the hand-over first: to x" in printed and "jog: not agreed" in printed
