@@ -62,13 +62,13 @@ docs: core $(DOCS_SETUP)
 core: setup
 	@.venv/bin/cmake --build $(BUILD) > $(BUILD)/build.log 2>&1 || { cat $(BUILD)/build.log; exit 1; }
 
-# The report of an error goes past pytest, which captures what Python prints and no more: the process ends there.
+# The report of an error goes past pytest, which captures what Python prints and no more: a process of pytest ends there.
 sanitize: core
 	@.venv/bin/cmake -S sim/csrc -B $(SANITIZE_BUILD) -G Ninja -DCMAKE_MAKE_PROGRAM=$(CURDIR)/.venv/bin/ninja \
 	  -DCMAKE_CXX_COMPILER=$(CXX) -DGELFLOW_SANITIZE=ON -DGELFLOW_INPLACE=ON > $(SANITIZE_BUILD).log 2>&1 && \
 	  .venv/bin/cmake --build $(SANITIZE_BUILD) >> $(SANITIZE_BUILD).log 2>&1 || { cat $(SANITIZE_BUILD).log; exit 1; }
 	@LD_PRELOAD="$(SANITIZE_PRELOAD)" ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=halt_on_error=1:print_stacktrace=1 \
-	  GELFLOW_CORE=sanitize .venv/bin/python -m pytest --capture=sys $(SANITIZE_TESTS)
+	  GELFLOW_CORE=sanitize .venv/bin/python -m pytest $(PARALLEL) --capture=sys $(SANITIZE_TESTS)
 	@.venv/bin/cmake -S perception/csrc -B $(SANITIZE_BUILD)-tracker -G Ninja \
 	  -DCMAKE_MAKE_PROGRAM=$(CURDIR)/.venv/bin/ninja -DCMAKE_CXX_COMPILER=$(CXX) -DGELFLOW_SANITIZE=ON \
 	  > $(SANITIZE_BUILD)-tracker.log 2>&1 && .venv/bin/cmake --build $(SANITIZE_BUILD)-tracker \

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import settings
 
 os.environ.setdefault("MPLBACKEND", "Agg")
-# Tests run in one process per core: several threads of NumPy and torch in each only wait for one another.
-for _library in ("OPENBLAS", "MKL"):
+# Tests run in one process per core: several threads of NumPy, torch and the core in each only wait for one another.
+for _library in ("OMP", "OPENBLAS", "MKL"):
     os.environ.setdefault(f"{_library}_NUM_THREADS", "1")
 
 # A shell ignores SIGINT for background jobs, nohup ignores SIGHUP, and child processes inherit that: tests of signals

@@ -10,7 +10,6 @@ from collections.abc import Collection, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from gelflow.sim.scene.geometry.sampling import (
     ENDS,
@@ -110,6 +109,8 @@ def largest_gap(geom: GeomDef, points: Array, faces: Collection[str]) -> float:
 
     The wall of a cylinder with points on both ends counts as sampled.
     """
+    from scipy.spatial import cKDTree  # deferred: slow to import
+
     distances, _ = cKDTree(points).query(_reference_points(geom, faces))
     return 2 * float(distances.max())
 

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
-from gelflow.gel.elastic_layer import round_cell_compliance, square_cell_compliance
 from gelflow.observation import Grid
 from gelflow.toml_tables import TomlTable
 
@@ -64,6 +63,8 @@ class LayerGel:
     @cached_property
     def compliance_matrix(self) -> Array:
         """The compliance [m/N], shape (3 n, 3 n): x, y, normal of each marker. Computed on first use."""
+        from gelflow.gel.elastic_layer import round_cell_compliance, square_cell_compliance  # deferred: slow to import
+
         if self.grid_shape is None:
             radius = np.sqrt(self.cell_area / np.pi)
             blocks = round_cell_compliance(self.positions, radius, self.poisson_ratio, self.thickness)

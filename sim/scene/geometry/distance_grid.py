@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from gelflow.errors import UsageError
 from gelflow.sim.scene.geometry.mesh import TriangleMesh, closed_mesh, nearest_points, signed_distances
@@ -106,6 +105,8 @@ def build_grid(mesh: TriangleMesh, name: str, *, resolution: int, rounding: floa
 
 def spline_grid(distances: Array, origin: Array, spacing: float) -> DistanceGrid:
     """The B-spline that interpolates distances [m] at the corners of cells, shape cells + 1; the first at `origin`."""
+    from scipy import ndimage  # deferred: only meshes need it
+
     padded = np.pad(distances, _PADDING, mode="reflect", reflect_type="odd")
     inner = slice(_PADDING - 1, 1 - _PADDING)
     coefficients = ndimage.spline_filter(padded, order=3, mode="mirror")[inner, inner, inner]

@@ -15,8 +15,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
-from scipy.special import elliprg
 
 from gelflow.errors import UsageError
 from gelflow.sim.scene.geometry.mesh import TriangleMesh
@@ -203,6 +201,8 @@ def ellipsoid(axes: Sequence[float], *, count: int, faces: Sequence[str] = ENDS)
     selected halves.
     Raises UsageError on a count below 1 or an unknown face.
     """
+    from scipy.special import elliprg  # deferred: only ellipsoids need it
+
     height = _heights("an ellipsoid", count, faces)
     sphere = np.column_stack([np.sqrt(1 - height**2)[:, None] * _spiral(count), height])
     a, b, c = axes
@@ -224,6 +224,8 @@ def mesh_surface(mesh: TriangleMesh, *, count: int) -> tuple[Array, Array]:
     points on the surface [m], shape (count, 3); area components of their cells along x, y, z [m²], shape (count, 3),
     which sum to the area of the mesh. Raises UsageError on a count below 1 or above 20 000.
     """
+    from scipy.spatial import cKDTree  # deferred: only meshes need it
+
     if not 1 <= count <= _MIN_SAMPLES:
         raise UsageError(f"a mesh needs a count of 1 to {_MIN_SAMPLES}, got {count}")
     samples, normals, total = _equal_area_samples(mesh, max(_SAMPLES_PER_POINT * count, _MIN_SAMPLES))

@@ -23,8 +23,9 @@ def confirmed(result: Calibration) -> set[str]:
 
 
 def test_forces_count_only_if_the_held_out_insertion_is_predicted(
-    world: RecordedWorld, monkeypatch: pytest.MonkeyPatch
+    world: RecordedWorld, calibrated: Calibration, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(calibration, "fit", lambda *args, **options: calibrated.fit)
     monkeypatch.setattr(calibration, "REPRODUCED", math.inf)
     monkeypatch.setattr(calibration, "PREDICTED", 0.0)
     fitted = Problem(world.recordings, threads=1).fitted
@@ -72,7 +73,11 @@ def test_nothing_counts_as_known_unless_more_than_half_of_the_searches_agree(
         assert any(line in text for text in error_lines(result)) is not result.converged
 
 
-def test_one_insertion_holds_nothing_out(world: RecordedWorld) -> None:
+def test_one_insertion_holds_nothing_out(
+    world: RecordedWorld, calibrated: Calibration, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The fit of the first insertion, whether or not another one is held out.
+    monkeypatch.setattr(calibration, "fit", lambda *args, **options: calibrated.fit)
     result = calibrate(world.recordings.of(np.array([0])), settings=LITTLE)
     assert result.held_out_residual is None and result.predicted is None
 
