@@ -11,7 +11,7 @@ import script
 
 from gelflow.perception.benchmark import curves
 from gelflow.policies.reproduction import picture as reproduction_picture
-from gelflow.sim.benchmark.speed import growth_picture
+from gelflow.sim.benchmark.speed import scaling_picture
 from gelflow.sim.benchmark.tradeoff import picture as tradeoff_picture
 from gelflow.sim.benchmark.tradeoff.run import Errors
 from gelflow.sim.benchmark.tradeoff.sweep import Measurement, Setting, Tradeoff
@@ -21,8 +21,8 @@ from gelflow.sim.validation.studies.mesh_distance import Result
 from gelflow.sim.validation.studies.schemes import Scheme
 
 
-def draw_growth(record: dict[str, Any], file: Path) -> None:
-    growth_picture.draw(record["growth"]["results"], file)
+def draw_scaling(record: dict[str, Any], file: Path) -> None:
+    scaling_picture.draw(record["scaling"]["results"], file)
 
 
 def draw_tracking(record: dict[str, Any], file: Path) -> None:
@@ -33,7 +33,7 @@ def draw_mesh_distance(record: dict[str, Any], file: Path) -> None:
     mesh_distance_picture.draw([Result(**result) for result in record["results"]], file)
 
 
-def draw_order(record: dict[str, Any], file: Path) -> None:
+def draw_convergence(record: dict[str, Any], file: Path) -> None:
     scenes = []
     for entry in record["convergence"]:
         fields = {name: value for name, value in entry.items() if name != "slopes"}
@@ -59,10 +59,10 @@ def draw_reproduction(record: dict[str, Any], file: Path) -> None:
 
 # picture → record in benchmarks/results, drawing function
 PICTURES: dict[str, tuple[str, Callable[[dict[str, Any], Path], None]]] = {
-    "growth": ("speed", draw_growth),
+    "scaling": ("speed", draw_scaling),
     "tracking": ("tracking", draw_tracking),
     "mesh_distance": ("mesh_distance", draw_mesh_distance),
-    "order": ("order", draw_order),
+    "convergence": ("convergence", draw_convergence),
     "reproduce_grasp": ("reproduce_grasp", draw_reproduction),
     "reproduce_cap": ("reproduce_cap", draw_reproduction),
     "reproduce_pushing": ("reproduce_pushing", draw_reproduction),

@@ -1,4 +1,4 @@
-"""Policies: networks, training, checkpoints and evaluation."""
+"""Policies: networks, training, evaluation, sweeps, reproduction of the paper, and calibration of the simulator."""
 
 import lazy_loader as _lazy
 

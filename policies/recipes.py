@@ -154,7 +154,7 @@ _INSERTION_PPO = PPOSettings(
     rollout=16, learning_rate=2e-3, last_learning_rate=0.1, discount=0.5, entropy=0.0, deviation=0.4
 )
 
-_RECIPES: dict[str, dict[str, Recipe]] = {
+RECIPES: dict[str, dict[str, Recipe]] = {
     "grasp": {
         DEFAULT: _grasp(_GRASP),
         PAPER: _grasp(_TABLE_6),
@@ -205,23 +205,12 @@ def recipe_for(task: str, name: str = DEFAULT) -> Recipe:
     """The recipe `name` of a task. Raises UsageError for an unknown task or name."""
     if task == "rolling":
         raise UsageError("no recipe trains 'rolling': the paper measures in this scene and trains nothing there")
-    if task not in _RECIPES:
-        raise UsageError(f"no recipe trains {task!r}; there are {', '.join(_RECIPES)}")
-    recipes = _RECIPES[task]
+    if task not in RECIPES:
+        raise UsageError(f"no recipe trains {task!r}; there are {', '.join(RECIPES)}")
+    recipes = RECIPES[task]
     if name not in recipes:
         raise UsageError(f"{task} has no recipe {name!r}; there are {', '.join(recipes)}")
     return recipes[name]
-
-
-def recipe_names(task: str) -> tuple[str, ...]:
-    """Names of the recipes of a task."""
-    recipe_for(task)
-    return tuple(_RECIPES[task])
-
-
-def trained_tasks() -> tuple[str, ...]:
-    """Names of the tasks that have a recipe."""
-    return tuple(_RECIPES)
 
 
 def train(task: str, folder: Path, **settings: Any) -> TrainingResult:

@@ -8,7 +8,7 @@ import math
 from collections.abc import Sequence
 
 from gelflow.errors import SafetyError
-from gelflow.geometry import Columns, PoseTuple, Quaternion, Vector, columns_quaternion, rotation_columns
+from gelflow.geometry import Columns, PoseTuple, Quaternion, Vector, columns_quaternion, dot, rotation_columns
 from gelflow.real.limits import LIMITS
 
 Joints = tuple[float, float, float, float, float, float]  # [rad]
@@ -141,14 +141,14 @@ def _solution(wrist: Vector, matrix: Columns, branch: tuple[bool, int, int], nea
     # The flange axes in the frame of joint 3: z6 = (−s5 c4, −s5 s4, c5), and along z3: x6 = s5 c6, y6 = −s5 s6,
     # where joint 6 still includes its DH offset of 180°.
     tool_x, tool_y, tool_z = matrix
-    zx, zy, zz = _dot(x3, tool_z), _dot(y3, tool_z), _dot(z3, tool_z)
+    zx, zy, zz = dot(x3, tool_z), dot(y3, tool_z), dot(z3, tool_z)
     sine = math.hypot(zx, zy)
     if sine < _SINGULAR and zz > 0:
-        total = math.atan2(_dot(y3, tool_x), _dot(x3, tool_x))
+        total = math.atan2(dot(y3, tool_x), dot(x3, tool_x))
         fourth, fifth, sixth = near[3], 0.0, total - near[3]
     else:
         fourth, fifth = math.atan2(-flip * zy, -flip * zx), math.atan2(flip * sine, zz)
-        sixth = math.atan2(-flip * _dot(z3, tool_y), flip * _dot(z3, tool_x))
+        sixth = math.atan2(-flip * dot(z3, tool_y), flip * dot(z3, tool_x))
     return (*arm, fourth, fifth, _closest_turn(_wrap(sixth - math.pi), near[5]))
 
 
@@ -159,10 +159,6 @@ def _closest_turn(angle: float, near: float) -> float:
     if angle > high:
         return angle - 2 * math.pi
     return angle + 2 * math.pi if angle < low else angle
-
-
-def _dot(a: Vector, b: Vector) -> float:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def _wrap(angle: float) -> float:

@@ -1,7 +1,7 @@
 from .benchmark.describe import describe as describe
 from .drawing.camera import Camera as Camera
 from .drawing.renderer import render as render
-from .drawing.scene_drawing import Mark as Mark
+from .drawing.scene_drawing import Polyline as Polyline
 from .reductions import TactileReduction as TactileReduction
 from .reductions import center_of_pressure as center_of_pressure
 from .reductions import mean_shear as mean_shear
@@ -52,8 +52,8 @@ __all__ = [
     "InsertionEnv",
     "InsertionVectorEnv",
     "LogUniform",
-    "Mark",
     "Normal",
+    "Polyline",
     "Randomization",
     "Scene",
     "Simulator",

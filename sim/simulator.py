@@ -44,14 +44,14 @@ class Simulator(StateArrays):
     Attributes
     ----------
     q, v: positions (N, nq), at first the scene's `q0`, and velocities (N, nv); like all state arrays writable views,
-        whose elements are set (`sim.q[:] = …`). Then call `clear_history`, or anchors and history are those before
+        whose elements are set (`sim.q[:] = …`). Then call `clear_history`: anchors and history are of the old state
     params: physical parameters (N, parameters), writable; see `param`
     anchors, anchored: state of the elastic friction law with na anchors, (N, na, 3) [m], and which of them are set,
         (N, na); an anchor that is not set has no meaning
     history: state of BDF2 with nh values, (N, nh): displacement of the previous step (nv), velocity before it (nv), and
         1 if a previous step exists; nh = 0 for BDF1
-    status: (N), 0 or the reason of failure, see `STATUS_MESSAGES`
-    iterations, halved: (N), Newton iterations and steps that were split into substeps, since the last reset
+    status: (N,), 0 or a failure code, see `STATUS_MESSAGES`
+    iterations, halved: (N,), Newton iterations and steps that were split into substeps, since the last reset
 
     In single precision the core stores the rounding residual of `q`, so that small increments accumulate, and computes
     relative poses of bodies in double. Gradients are in double, except the part of viscous marker forces.

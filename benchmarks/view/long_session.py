@@ -81,7 +81,7 @@ def measure(path: Path, jumps: int, rng: np.random.Generator) -> None:
     before = time.perf_counter()
     with RecordedSession(path) as session:
         session.at(session.start, markers=False)
-        print(f"open: {time.perf_counter() - before:.2f} s, {len(session.marks)} marks")
+        print(f"open: {time.perf_counter() - before:.2f} s, {len(session.timeline_events)} events")
         taken = []
         for target in rng.uniform(session.start, session.end, jumps):
             before = time.perf_counter()

@@ -12,8 +12,8 @@ from gelflow.errors import GelflowError, PeerError
 from gelflow.hardware_mocks.camera.device import MockMjpegCamera
 from gelflow.hardware_mocks.egm.device import MockEgmArm
 from gelflow.hardware_mocks.faults.plan import KINDS, Fault, FaultPlan
+from gelflow.hardware_mocks.simulated_cell.insertion_progress import PHASES, InsertionProgress
 from gelflow.hardware_mocks.simulated_cell.process import SimulatedCellProcess
-from gelflow.hardware_mocks.simulated_cell.progress import PHASES, Progress
 from gelflow.hardware_mocks.wsg.device import MockWsgGripper
 from gelflow.task import InsertionTask
 from gelflow.time_sync import MIN_WAIT
@@ -99,7 +99,7 @@ class Devices:
         return self.cameras if device == "cameras" else (self.cameras[device == "right_camera"],)
 
 
-def event_occurred(fault: Fault, progress: Progress, task: InsertionTask) -> bool:
+def event_occurred(fault: Fault, progress: InsertionProgress, task: InsertionTask) -> bool:
     """Whether the event of a fault has occurred in the insertion `task`."""
     gripped = progress.phase == PHASES.index("gripped")
     if fault.event == "gripped":
@@ -129,7 +129,7 @@ class Occurrence:
         self._end = math.inf  # while it is active [s]
         self.active = False
 
-    def begins(self, now: float, progress: Progress) -> bool:
+    def begins(self, now: float, progress: InsertionProgress) -> bool:
         """Whether it begins now; `now` is robot time [s]."""
         fault = self.fault
         if self.active or self._done or not progress.started <= now:  # started is NaN before the first command

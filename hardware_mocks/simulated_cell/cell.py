@@ -19,8 +19,8 @@ from gelflow.errors import UsageError
 from gelflow.geometry import Pose, conjugate, rotate, yaw_quaternion
 from gelflow.hardware_mocks.simulated_cell.cell_physics import CellPhysics, pad_overrides
 from gelflow.hardware_mocks.simulated_cell.gripper_drive import GripperDrive
+from gelflow.hardware_mocks.simulated_cell.insertion_progress import InsertionMonitor, InsertionProgress
 from gelflow.hardware_mocks.simulated_cell.part_truth import PartTruth, SlipMonitor, is_inside
-from gelflow.hardware_mocks.simulated_cell.progress import Progress, ProgressMonitor
 from gelflow.hardware_mocks.simulated_cell.world import Friction, World, training_world
 from gelflow.observation import Grid, interpolation_weights
 from gelflow.sim.scene import load_scene
@@ -131,7 +131,7 @@ class SimulatedCell:
         self.parts: list[PartTruth] = []
         self._current: PartTruth | None = None
         self._slip: SlipMonitor | None = None  # while a part is gripped
-        self._progress = ProgressMonitor(config.task)
+        self._progress = InsertionMonitor(config.task)
         self._taught_to_base = config.taught_hole.inverse()
         self._height = 0.0  # of the gripper's lower face above the taught hole [m]
         self._truth_due = 0.0  # time of its next measurement [s]
@@ -244,8 +244,8 @@ class SimulatedCell:
                 "pads": [float(np.abs(self._sim.tactile()[0, pad, :2]).max()) for pad in self._pads],
             }
 
-    def progress(self) -> Progress:
-        """Progress of the present part."""
+    def progress(self) -> InsertionProgress:
+        """Progress of the insertion of the present part."""
         with self._lock:
             return replace(self._progress.progress)
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from gelflow.clock import ScaledClock
 from gelflow.errors import SimulationError
 from gelflow.hardware_mocks.simulated_cell.cell import SimulatedCell, SimulatedCellConfig
-from gelflow.hardware_mocks.simulated_cell.progress import Progress
+from gelflow.hardware_mocks.simulated_cell.insertion_progress import InsertionProgress
 from gelflow.helper_process import HelperProcess, Messages, connect_to_parent, memory_file
 from gelflow.observation import Grid
 from gelflow.session.records import from_plain, to_plain
@@ -63,12 +63,12 @@ class _Shared:
         self.command = _SharedBlock(words, self.arm.end, 3)  # of the gripper: width [m], speed [m/s], force [N]
         self.fingers = _SharedBlock(words, self.command.end, 3)  # measured: width, speed, force
         self.gels = _SharedBlock(words, self.fingers.end, 4 * markers)
-        self.progress = _SharedBlock(words, self.gels.end, Progress.WORDS)
+        self.progress = _SharedBlock(words, self.gels.end, InsertionProgress.WORDS)
 
     @staticmethod
     def size(grid: Grid) -> int:
         """Size of the memory [bytes]."""
-        return 8 * (8 + 4 + 4 + 1 + 4 * grid.rows * grid.cols + 1 + Progress.WORDS)
+        return 8 * (8 + 4 + 4 + 1 + 4 * grid.rows * grid.cols + 1 + InsertionProgress.WORDS)
 
 
 class SimulatedCellProcess:
@@ -155,9 +155,9 @@ class SimulatedCellProcess:
         """See `SimulatedCell.next_seed`."""
         self._ask({"ask": "next_seed", "seed": seed})
 
-    def progress(self) -> Progress:
+    def progress(self) -> InsertionProgress:
         """See `SimulatedCell.progress`."""
-        return Progress.from_words(self._running().progress.read()[1].tolist())
+        return InsertionProgress.from_words(self._running().progress.read()[1].tolist())
 
     def change_world(self, *, gel_stiffness: float, pad_friction: float) -> None:
         """See `SimulatedCell.change_world`."""

@@ -56,7 +56,7 @@ class SlipEstimate:
 
 
 @dataclass(frozen=True)
-class _Moment:
+class _Sample:
     stamp: float
     centre: Array  # of pressure [pitches]
     surface: Array  # mean displacement under the contact [pitches]
@@ -81,7 +81,7 @@ class SlipEstimator:
         self._stated = friction
         self._friction, self._deviation = friction, friction_deviation
         self._stated_deviation = friction_deviation
-        self._history: deque[_Moment] = deque()
+        self._history: deque[_Sample] = deque()
         self._certain: list[float] = []  # ratios of forces in a certain gross slip
         self._since: float | None = None
         self._slip = PartialSlip(_EXPONENT, _LOAD_NOISE)
@@ -113,7 +113,7 @@ class SlipEstimator:
             return SlipEstimate(None, None, False, None, 1.0, self._friction, self._observed())
         surface = weights @ np.where(valid[:, None], displacement, 0.0) / (weights.sum() * self._pitch)
         centre = force.normal_field @ self._positions / force.normal_field.sum()
-        self._history.append(_Moment(stamp, centre, surface, force.normal))
+        self._history.append(_Sample(stamp, centre, surface, force.normal))
         while self._history[0].stamp < stamp - _MEMORY and len(self._history) > 2:
             self._history.popleft()
         ratio = self._ratio(force, centre)

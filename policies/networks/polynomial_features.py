@@ -27,6 +27,11 @@ def polynomial_basis(grid: Grid, degree: int) -> Array:
     return np.asarray(q * np.sign(np.diag(r)) / np.sqrt(len(positions)))
 
 
+def num_features(channels: int, degree: int) -> int:
+    """Number of polynomial features of a flow map with `channels` channels."""
+    return channels * (degree + 1) * (degree + 2) // 2
+
+
 def reduce_maps(images: NDArray[Any], basis: Array) -> Array:
     """Polynomial features (n, channels * terms) of flow maps (n, channels, rows, cols)."""
     n, channels = images.shape[:2]

@@ -22,7 +22,7 @@ from gelflow.policies.networks.flow_map_policy import (
 )
 from gelflow.policies.networks.layers import gru_cell, linear
 from gelflow.policies.networks.mirror_symmetry import reflections
-from gelflow.policies.networks.polynomial_features import reduce_maps
+from gelflow.policies.networks.polynomial_features import num_features, reduce_maps
 from gelflow.task import InsertionTask, TaskDescription
 
 _MOTION = 6  # inputs beside the features: the latest correction, and the displacement from the start
@@ -49,7 +49,7 @@ class PolynomialGRU(Architecture):
 
     def features(self, task: InsertionTask) -> int:
         """Number of features of one flow map."""
-        return task.observation_shape[0] * (self.degree + 1) * (self.degree + 2) // 2
+        return num_features(task.observation_shape[0], self.degree)
 
     def inputs(self, task: InsertionTask) -> int:
         """Number of inputs of the first layer."""

@@ -22,7 +22,7 @@ from gelflow.policies.networks.flow_map_policy import (
 )
 from gelflow.policies.networks.layers import linear
 from gelflow.policies.networks.mirror_symmetry import MirrorSymmetry
-from gelflow.policies.networks.polynomial_features import reduce_maps
+from gelflow.policies.networks.polynomial_features import num_features, reduce_maps
 from gelflow.task import InsertionTask, TaskDescription
 
 Array = NDArray[np.float64]
@@ -48,7 +48,7 @@ class PolynomialMLP(Architecture):
 
     def features(self, task: InsertionTask) -> int:
         """Number of features of one flow map."""
-        return task.observation_shape[0] * (self.degree + 1) * (self.degree + 2) // 2
+        return num_features(task.observation_shape[0], self.degree)
 
     def inputs(self, task: InsertionTask) -> int:
         """Length of the perceptron input, see `History.observe`."""

@@ -11,7 +11,7 @@ from enum import IntFlag
 from typing import NamedTuple
 
 from gelflow.errors import SafetyError
-from gelflow.geometry import PoseTuple, Quaternion, Vector, compose, invert, multiply
+from gelflow.geometry import PoseTuple, Quaternion, Vector, compose, dot, invert, multiply
 from gelflow.real.egm.codec import EgmFeedback
 from gelflow.real.egm.config import EgmConfig
 from gelflow.real.egm.target import Target, check_target, tool_frame
@@ -252,7 +252,7 @@ class ReferenceGenerator:
         for way, ahead, margin in ((move, lead, config.lead_margin), (turn, lead_turn, config.turn_lead_margin)):
             speed = _length(way) / remaining
             if speed > 0.0:
-                allowed = min(allowed, config.lead_time + (margin - _dot(ahead, _direction(way))) / speed)
+                allowed = min(allowed, config.lead_time + (margin - dot(ahead, _direction(way))) / speed)
         return max(0.0, allowed)
 
     def _brake(self) -> None:
@@ -261,8 +261,8 @@ class ReferenceGenerator:
             return
         count, along, about = self._braking
         lead, lead_turn = _difference((self._feedback.position, self._feedback.quaternion), self._reference)
-        back = max(0.0, min(_dot(lead, along), self._config.max_speed * self._config.cycle))
-        turned = max(0.0, min(_dot(lead_turn, about), self._config.max_turn_speed * self._config.cycle))
+        back = max(0.0, min(dot(lead, along), self._config.max_speed * self._config.cycle))
+        turned = max(0.0, min(dot(lead_turn, about), self._config.max_turn_speed * self._config.cycle))
         self._reference = _moved(self._reference, _scaled(along, -back), _scaled(about, -turned), 1.0)
         at_rest = back == turned == 0.0
         self._braking = None if at_rest or count <= 1 else (count - 1, along, about)
@@ -318,10 +318,6 @@ def _turned(quaternion: Quaternion, turn: Vector, share: float) -> Quaternion:
 
 def _length(v: Vector) -> float:
     return math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
-
-
-def _dot(a: Vector, b: Vector) -> float:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def _scaled(v: Vector, factor: float) -> Vector:

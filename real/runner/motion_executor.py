@@ -17,10 +17,10 @@ from gelflow.real.egm.cycle_log import EgmCycle
 from gelflow.real.egm.driver import EgmArm
 from gelflow.real.egm.reference_generator import EgmFlag
 from gelflow.real.limits import LIMITS
+from gelflow.real.runner.approach_monitor import ARRIVED, ApproachMonitor
 from gelflow.real.runner.checks import DataChecks
 from gelflow.real.runner.lab import Lab
 from gelflow.real.runner.phases import with_advice
-from gelflow.real.runner.progress import ARRIVED, Progress
 from gelflow.real.runner.supervisor import Supervisor
 from gelflow.real.web_services.monitor import ControllerMonitor
 from gelflow.real.wsg.checks import fingers_move, may_hold_part
@@ -122,15 +122,15 @@ class MotionExecutor:
         state = self._arm.state()
         return self._lab.gripper_pose(state.position, state.quaternion)
 
-    def go(
+    def start_motion(
         self, target: Pose, *, speed: float | None = None, turn_speed: float | None = None, guarded: bool = False
     ) -> None:
         """Start a straight motion of the gripper frame to `target` and return.
 
         Speeds [m/s], [rad/s]; None: those of the lab file. `guarded` states that the caller observes both pads until
-        the end of the motion, as `GuardedMotion` does, and calls `observed` each time. Raises SafetyError when the
-        supervisor refuses the target, when the phase allows no motion, and when a part is held and the motion is not
-        guarded; the arm then holds.
+        the end of the motion, as `GuardedMotion` does, and calls `report_observation` each time. Raises SafetyError
+        when the supervisor refuses the target, when the phase allows no motion, and when a part is held and the motion
+        is not guarded; the arm then holds.
         """
         self._raise_failure()
         self.supervisor.phases.require_motion()
@@ -155,10 +155,10 @@ class MotionExecutor:
         self._recorder.arm_command(stamp, tool.position, tool.quaternion, kind="command")
         self._recorder.event("move", {"speed": speeds[0], "turn_speed": speeds[1], "position": tool.position})
 
-    def observed(self, age: float) -> bool:
+    def report_observation(self, age: float) -> bool:
         """The caller of a guarded motion has observed both pads, in images of at most this age [s].
 
-        Returns False when the arm holds because this took too long: `go` continues.
+        Returns False when the arm holds because this took too long: `start_motion` continues.
         """
         with self._lock:
             self._observe_until = self._clock.now() + max(_LEAST_TIME, LIMITS.image_age - _HOLD_TIME - age)
@@ -179,15 +179,15 @@ class MotionExecutor:
 
     def move(self, target: Pose, *, speed: float | None = None) -> None:
         """Move to `target` and wait for the arrival. Raises PeerTimeout when the arm comes no closer for 3 s."""
-        self.go(target, speed=speed)
-        progress = self.progress(target)
+        self.start_motion(target, speed=speed)
+        progress = self.approach_monitor(target)
         while not self.arrived():
             progress.check()
             self.wait(0.02)
 
-    def progress(self, target: Pose) -> Progress:
+    def approach_monitor(self, target: Pose) -> ApproachMonitor:
         """Monitors from now on whether the arm comes closer to `target`."""
-        return Progress(self.pose, self.hold, target, self._clock)
+        return ApproachMonitor(self.pose, self.hold, target, self._clock)
 
     def wait(self, seconds: float) -> None:
         """Wait for `seconds` of robot time. Raises the failure of the thread, or PartLost."""
@@ -276,7 +276,7 @@ class MotionExecutor:
 
     def _hold_unobserved(self, now: float) -> None:
         """Hold when the caller of a guarded motion has not observed the pads in time: its thread is delayed."""
-        with self._lock:  # together with the test, so that no `go` comes in between
+        with self._lock:  # together with the test, so that no `start_motion` comes in between
             if self._goal is None or now <= self._observe_until or self.arrived():
                 return
             self._unobserved, self._goal = True, None

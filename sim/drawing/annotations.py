@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.sim.drawing.ray_caster import View
-from gelflow.sim.drawing.scene_drawing import ContactForce, Mark, PadReading, SceneDrawing
+from gelflow.sim.drawing.scene_drawing import ContactForce, PadReading, Polyline, SceneDrawing
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
@@ -68,11 +68,11 @@ def annotate(
     scales: ForceScales,
     tile: float,
     title: str,
-    marks: Sequence[Mark],
+    polylines: Sequence[Polyline],
 ) -> None:
-    """Draw marks, forces, panels, scales and title into a picture; `seen` is the distance of each pixel [m]."""
-    for mark in marks:
-        _draw_mark(picture, mark, view)
+    """Draw polylines, forces, panels, scales and title into a picture; `seen` is the distance of each pixel [m]."""
+    for polyline in polylines:
+        _draw_polyline(picture, polyline, view)
     for pad in drawing.pads:
         _draw_markers(picture, pad, view, seen, scales.normal)
     length = _ARROW_SHARE * view.size[1] * view.camera.distance / view.focal / scales.contact  # [m/N]
@@ -83,19 +83,19 @@ def annotate(
     _text(picture, title, (8, 18))
 
 
-def _draw_mark(picture: Picture, mark: Mark, view: View) -> None:
+def _draw_polyline(picture: Picture, polyline: Polyline, view: View) -> None:
     """A dashed line with its label at the first point."""
     dense = []
-    for start, end in zip(mark.points[:-1], mark.points[1:], strict=True):
+    for start, end in zip(polyline.points[:-1], polyline.points[1:], strict=True):
         dense.append(start + np.linspace(0, 1, 9)[:-1, None] * (end - start))
-    pixels, depth = view.project(np.concatenate([*dense, mark.points[-1:]]))
+    pixels, depth = view.project(np.concatenate([*dense, polyline.points[-1:]]))
     if (depth <= 0).any():
         return
     along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(pixels, axis=0), axis=1))])
     for (start, end), at in zip(pairwise(pixels), along[:-1], strict=True):
         if at % 12 < 8:
             cv2.line(picture, _fixed(start), _fixed(end), _INK, 1, cv2.LINE_AA, _FRACTION_BITS)
-    _text(picture, mark.label, (int(pixels[0, 0]) + 5, int(pixels[0, 1]) - 5))
+    _text(picture, polyline.label, (int(pixels[0, 0]) + 5, int(pixels[0, 1]) - 5))
 
 
 def _draw_markers(picture: Picture, pad: PadReading, view: View, seen: Array, scale: float) -> None:

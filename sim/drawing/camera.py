@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.sim.arguments import shown
-from gelflow.sim.drawing.scene_drawing import Mark, SceneDrawing
+from gelflow.sim.drawing.scene_drawing import Polyline, SceneDrawing
 from gelflow.sim.scene.mjcf.mechanics import WORLD, GeomDef
 from gelflow.toml_tables import suggestion
 
@@ -54,9 +54,9 @@ class Camera:
 
 
 def framing_camera(
-    drawings: list[SceneDrawing], view: str = "oblique", *, aspect: float = 1.0, marks: Sequence[Mark] = ()
+    drawings: list[SceneDrawing], view: str = "oblique", *, aspect: float = 1.0, polylines: Sequence[Polyline] = ()
 ) -> Camera:
-    """A camera that sees the moving bodies, the pads, what is near them in all drawings of a scene, and marks.
+    """A camera that sees the moving bodies, the pads, what is near them in all drawings of a scene, and polylines.
 
     `view` is one of `VIEWS`, `aspect` width by height of the picture. Raises UsageError on an unknown view.
     """
@@ -66,7 +66,7 @@ def framing_camera(
     points = [pad.positions for drawing in drawings for pad in drawing.pads]
     points += [np.array([pose.position for pose in drawing.poses]) for drawing in drawings if not moving and not points]
     points += moving
-    corners = np.concatenate([*points, *(mark.points for mark in marks)])
+    corners = np.concatenate([*points, *(polyline.points for polyline in polylines)])
     size = float(np.ptp(corners, axis=0).max())
     for geom in drawings[0].geoms:
         if geom.body == WORLD and geom.kind != "plane":

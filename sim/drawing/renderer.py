@@ -11,7 +11,7 @@ from gelflow.sim import arguments
 from gelflow.sim.drawing.annotations import ForceScales, annotate, force_scales, panel_width, round_scale
 from gelflow.sim.drawing.camera import Camera, framing_camera
 from gelflow.sim.drawing.ray_caster import RayCaster, View
-from gelflow.sim.drawing.scene_drawing import Mark, SceneDrawing, scene_drawing
+from gelflow.sim.drawing.scene_drawing import Polyline, SceneDrawing, scene_drawing
 from gelflow.sim.simulator import Simulator
 
 DEFAULT_SIZE = (640, 480)
@@ -35,21 +35,23 @@ class Renderer:
         camera: Camera | str = "oblique",
         *,
         title: str = "",
-        marks: Sequence[Mark] = (),
+        polylines: Sequence[Polyline] = (),
     ) -> NDArray[np.uint8]:
         """See `render`."""
         drawing = scene_drawing(self._sim, env)
         if not isinstance(camera, Camera):
-            # Framed at the start of the scene and with the marks, so that the camera rests while the bodies move.
-            camera = self.camera([self._at_start()], camera, size, marks=marks)
-        return self.draw(drawing, size, camera, title=title, marks=marks)
+            # Framed at the start of the scene and with the polylines, so that the camera rests while the bodies move.
+            camera = self.camera([self._at_start()], camera, size, polylines=polylines)
+        return self.draw(drawing, size, camera, title=title, polylines=polylines)
 
     def camera(
-        self, drawings: list[SceneDrawing], view: str, size: tuple[int, int], *, marks: Sequence[Mark] = ()
+        self, drawings: list[SceneDrawing], view: str, size: tuple[int, int], *, polylines: Sequence[Polyline] = ()
     ) -> Camera:
-        """A camera with a view of `VIEWS` that has all drawings and marks beside the panels of the pads."""
+        """A camera with a view of `VIEWS` that has all drawings and polylines beside the panels of the pads."""
         width, height = _checked_size(size)
-        return framing_camera(drawings, view, aspect=(width - _panels(drawings[0], width)) / height, marks=marks)
+        return framing_camera(
+            drawings, view, aspect=(width - _panels(drawings[0], width)) / height, polylines=polylines
+        )
 
     def draw(
         self,
@@ -59,7 +61,7 @@ class Renderer:
         *,
         scales: ForceScales | None = None,
         title: str = "",
-        marks: Sequence[Mark] = (),
+        polylines: Sequence[Polyline] = (),
     ) -> NDArray[np.uint8]:
         """A picture of a drawing of this simulator; `scales` of the forces are by default chosen for the picture."""
         width, height = _checked_size(size)
@@ -68,7 +70,7 @@ class Renderer:
         picture, seen = self._caster_for(drawing).draw(drawing, view, tile=tile)
         annotate(
             picture, drawing, view,
-            seen=seen, scales=scales or force_scales([drawing]), tile=tile, title=title, marks=marks,
+            seen=seen, scales=scales or force_scales([drawing]), tile=tile, title=title, polylines=polylines,
         )  # fmt: skip
         return picture
 
@@ -95,7 +97,7 @@ def render(
     camera: Camera | str = "oblique",
     *,
     title: str = "",
-    marks: Sequence[Mark] = (),
+    polylines: Sequence[Polyline] = (),
 ) -> NDArray[np.uint8]:
     """A picture of an environment at its present state: RGB, shape (height, width, 3).
 
@@ -111,15 +113,15 @@ def render(
     size: width and height [px]
     camera: a `Camera`, or a view that is framed to the scene at its start: "oblique", "front", "side" or "top"
     title: a line at the top
-    marks: lines in the world
+    polylines: lines in the world
 
-    Raises UsageError for a wrong environment, size, view or mark, and for a simulator of a core model.
+    Raises UsageError for a wrong environment, size, view or polyline, and for a simulator of a core model.
     """
     arguments.check_type("sim", sim, Simulator, "a Simulator")
-    if not isinstance(marks, Sequence) or not all(isinstance(mark, Mark) for mark in marks):
-        raise UsageError(f"marks must be a list of Mark, got {arguments.shown(marks)}")
+    if not isinstance(polylines, Sequence) or not all(isinstance(polyline, Polyline) for polyline in polylines):
+        raise UsageError(f"polylines must be a list of Polyline, got {arguments.shown(polylines)}")
     arguments.check_type("title", title, str, "a string")
-    return _renderers.setdefault(sim, Renderer(sim)).picture(env, size, camera, title=title, marks=marks)
+    return _renderers.setdefault(sim, Renderer(sim)).picture(env, size, camera, title=title, polylines=polylines)
 
 
 def _panels(drawing: SceneDrawing, width: int) -> int:

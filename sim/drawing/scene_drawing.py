@@ -26,18 +26,18 @@ _NO_FORCE = 1e-6  # [N]; smaller contact forces are not drawn
 
 
 @dataclass(frozen=True, eq=False)
-class Mark:
+class Polyline:
     """A line that is drawn into the scene, such as the outline of a goal. Raises UsageError for invalid points."""
 
     points: Array  # in the world [m], (n, 3)
     label: str
 
     def __post_init__(self) -> None:
-        points = arguments.number_array("points of a mark", self.points, float)
+        points = arguments.number_array("points of a polyline", self.points, float)
         if points.ndim != 2 or points.shape[1] != 3 or not len(points) or not np.isfinite(points).all():
             given = arguments.shown(self.points)
-            raise UsageError(f"points of a mark must be a list of [x, y, z], all finite, got {given}")
-        arguments.check_type("the label of a mark", self.label, str, "a string")
+            raise UsageError(f"points of a polyline must be a list of [x, y, z], all finite, got {given}")
+        arguments.check_type("the label of a polyline", self.label, str, "a string")
         object.__setattr__(self, "points", points)
 
 

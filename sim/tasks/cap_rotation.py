@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
-from gelflow.sim.drawing.scene_drawing import Mark
+from gelflow.sim.drawing.scene_drawing import Polyline
 from gelflow.sim.reductions import TactileReduction, pad_forces, pad_pressures
 from gelflow.sim.scene import Scene
 from gelflow.sim.tasks.control_task import ControlDescription, ControlTask
@@ -323,10 +323,10 @@ class CapRotation(ControlTask):
         x, y, radius = (float(self.sim.param(f"cap.{name}")[index]) for name in ("pos.x", "pos.y", "size.x"))
         angle = float(self.info["angle"][index])
         ends = [(x, y), (x + radius * np.cos(angle), y + radius * np.sin(angle))]
-        mark = Mark(np.array([(*end, self._top) for end in ends]), "cap")
+        polyline = Polyline(np.array([(*end, self._top) for end in ends]), "cap")
         goal = np.degrees(self.description.goal_angle)
         title = f"Cap rotation: turned {np.degrees(angle):.0f}° of {goal:.0f}°"
-        return render(self.sim, index, title=title, marks=[mark])
+        return render(self.sim, index, title=title, polylines=[polyline])
 
 
 def _fingertip_rows(scene: Scene) -> TactileReduction:

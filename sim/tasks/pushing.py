@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.observation import Grid
-from gelflow.sim.drawing.scene_drawing import Mark
+from gelflow.sim.drawing.scene_drawing import Polyline
 from gelflow.sim.tasks.control_task import ControlDescription, ControlTask
 from gelflow.sim.tasks.randomization import Fixed, Quantity, Randomization
 from gelflow.sim.tasks.sensor_model import NO_SENSOR_EFFECTS, SENSOR_QUANTITIES
@@ -339,7 +339,7 @@ class Pushing(ControlTask):
         corners = self.half_size[index] * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
         cos, sin = np.cos(yaw), np.sin(yaw)
         outline = corners @ np.array([[cos, sin], [-sin, cos]]) + [x, y]
-        goal = Mark(np.column_stack([outline, np.zeros(len(outline))]), "goal")
+        goal = Polyline(np.column_stack([outline, np.zeros(len(outline))]), "goal")
         apart = 1e3 * self.info["position_error"][index], np.degrees(self.info["yaw_error"][index])
         title = "Pushing: box {:.0f} mm and {:.0f}° from its goal".format(*apart)
-        return render(self.sim, index, title=title, marks=[goal])
+        return render(self.sim, index, title=title, polylines=[goal])

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.observation import Grid
-from gelflow.sim.drawing.scene_drawing import Mark
+from gelflow.sim.drawing.scene_drawing import Polyline
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.tasks.control_task import ControlDescription, ControlTask
 from gelflow.sim.tasks.randomization import Randomization
@@ -177,6 +177,6 @@ class Rolling(ControlTask):
         angle = np.linspace(0, 2 * np.pi, 65)
         radius = float(self.sim.param("ball.size.x")[index])
         circle = self.goal[index] + radius * np.column_stack([np.cos(angle), np.sin(angle)])
-        goal = Mark(np.column_stack([circle, np.full(len(angle), radius)]), "goal")
+        goal = Polyline(np.column_stack([circle, np.full(len(angle), radius)]), "goal")
         title = f"Rolling: ball {1e3 * self.info['error'][index]:.1f} mm from its goal"
-        return render(self.sim, index, title=title, marks=[goal])
+        return render(self.sim, index, title=title, polylines=[goal])

@@ -36,6 +36,11 @@ def conjugate(q: Sequence[float] | Array) -> Quaternion:
     return (w, -x, -y, -z)
 
 
+def dot(a: Vector, b: Vector) -> float:
+    """Scalar product."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
 def rotate(q: Sequence[float] | Array, v: Sequence[float] | Array) -> Vector:
     """The vector `v` [any unit] rotated by the unit quaternion `q`."""
     w, x, y, z = q

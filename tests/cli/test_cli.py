@@ -7,6 +7,7 @@ import re
 import socket
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +43,13 @@ COMMON_OPTIONS = {
     "soak": {"--json", "--out", "--seed", "--preset"},
     "demo": {"--json", "--out", "--seed", "--preset", "--quick", "--checkpoint"},
 }
+
+
+def test_a_warning_is_printed_once(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(warnings, "formatwarning", warnings.formatwarning)
+    assert main(["describe", "rolling", "--json", "--repeats", "1"]) == 0
+    shown = [warnings.formatwarning(UserWarning(text), UserWarning, "a.py", line) for line, text in enumerate("aab")]
+    assert shown == ["gelflow: a\n", "", "gelflow: b\n"]
 
 
 def help_text(command: str, capsys: pytest.CaptureFixture[str]) -> str:

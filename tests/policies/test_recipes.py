@@ -19,7 +19,7 @@ from gelflow.policies.checkpoint import load_network
 from gelflow.policies.episodes import Episodes, Film, OraclePolicy, RandomPolicy, record_films, run_episodes
 from gelflow.policies.networks.mlp import MLP
 from gelflow.policies.networks.torch_actor import TorchActor
-from gelflow.policies.recipes import recipe_for, recipe_names, trained_tasks
+from gelflow.policies.recipes import RECIPES, recipe_for
 from gelflow.policies.reports.evaluation_report import evaluate_all
 from gelflow.policies.reports.failures import failure_ranges, worst_ranges
 from gelflow.sim.tasks.gripper.flow_map_noise import FlowMapNoise
@@ -43,13 +43,13 @@ def test_the_help_of_train_states_the_default_steps(
     with pytest.raises(SystemExit):
         main(["train", "--help"])
     text = " ".join(capsys.readouterr().out.split())
-    steps = {task: recipe_for(task).steps for task in trained_tasks()}
+    steps = {task: recipe_for(task).steps for task in RECIPES}
     assert all(f"{task} {count}" in text for task, count in steps.items())
     assert f"with --start {recipe_for('insertion', 'fine-tuning').steps}, " in text
     assert f"with --algorithm ppo {recipe_for('insertion', 'ppo').steps};" in text
     for task in steps.keys() - {"insertion"}:
         others: dict[int, list[str]] = {}
-        for name in recipe_names(task):
+        for name in RECIPES[task]:
             if (count := recipe_for(task, name).steps) != steps[task]:
                 others.setdefault(count, []).append(name)
         listed = "".join(f", with --recipe {' or '.join(names)} {count}" for count, names in others.items())
@@ -95,12 +95,12 @@ def test_noise_on_flow_maps_is_an_option_of_the_insertion() -> None:
 
 
 def test_the_commands_know_the_tasks_of_the_recipes() -> None:
-    assert set(trained_tasks()) == set(TASKS)
+    assert set(RECIPES) == set(TASKS)
 
 
 @pytest.mark.parametrize("task", [name for name in TASKS if name in task_names()])
 def test_every_recipe_makes_a_learner(task: str) -> None:
-    for name in recipe_names(task):
+    for name in RECIPES[task]:
         recipe = recipe_for(task, name)
         batch = recipe.make_task(2)
         assert recipe.make_learner(batch, seed=0, steps=recipe.steps).steps == 0

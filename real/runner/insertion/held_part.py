@@ -84,7 +84,7 @@ class HeldPart:
         )
         self._baseline: NDArray[np.float64] = np.zeros((2, 2))
 
-    def limit(self, deadline: float) -> None:
+    def set_deadline(self, deadline: float) -> None:
         """Set the robot time [s] after which approach, descent and lowering raise PeerTimeout; retreat goes on."""
         self._deadline = deadline
 
@@ -259,7 +259,7 @@ class HeldPart:
     def _keep(self, reading: TactileReading, start: float) -> float:
         """Add a reading to those of the attempt; returns its depth below `start` [m]."""
         depth = float(start - self._motion.height_at(reading.frame.stamp))
-        self._guard.observer.keep(replace(reading, depth=depth))
+        self._guard.observer.add_reading(replace(reading, depth=depth))
         return depth
 
     def _lower_face(self) -> float:

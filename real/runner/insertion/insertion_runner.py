@@ -253,7 +253,7 @@ class InsertionRunner:
     def _attempt(self, number: int, index: int, part: HeldPart) -> Attempt:
         begun = self._clock.now()
         planar_pose = self._planar_pose
-        part.limit(begun + self._lab.limits.attempt_time)
+        part.set_deadline(begun + self._lab.limits.attempt_time)
         part.go_to_start(planar_pose, Phase.CORRECT if index else Phase.APPROACH)
         self._motion.supervisor.phases.enter(Phase.DESCEND)
         self._motion.wait(self._lab.descent.settle)
@@ -261,7 +261,7 @@ class InsertionRunner:
         motion = self._motions[index] if self._motions else None
         depth, stop = (self._task.descent, None) if motion is None else (motion.depth, motion.stop_shear_mm)
         descent = part.descend(planar_pose, observer, depth, stop)
-        last, frames = descent.last, observer.chosen((depth,) if self._motions else self._task.frame_depths)
+        last, frames = descent.last, observer.readings_at_depths((depth,) if self._motions else self._task.frame_depths)
         contact = last.shear > part.thresholds.contact
         reached = self._task.start_height - last.depth < self._task.success_height
         inserted = False
@@ -287,7 +287,7 @@ class InsertionRunner:
         """The forces in the newest images, at the end of an attempt and after its decision."""
         if self._forces is None:
             return ()
-        observer.pass_on()
+        observer.publish_results()
         return self._forces.of(observer.newest_images)
 
     def _record_decision(

@@ -92,7 +92,7 @@ def check_grasp(
         if x < least or abs(np.degrees(np.arctan2(y - grip_shear, x))) > _LARGEST_ANGLE:
             angle = float(np.degrees(np.arctan2(y, x)))
             raise TouchImplausible(
-                f"{side} camera: the weight of the grasped part points {angle:+.0f}° away from the fingertip; "
+                f"{side} camera: the shear by the part's weight is {angle:+.0f}° from the direction to the fingertip; "
                 f"check rotation_deg, mirrored and the gripper's orientation in the lab file"
             )
     contact = min(nominal.contact, _WEIGHT_FRACTION * float(weight[:, 0].min()))

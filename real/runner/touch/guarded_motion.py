@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from gelflow.clock import ScaledClock
 from gelflow.errors import PeerTimeout
 from gelflow.geometry import Pose
+from gelflow.real.runner.approach_monitor import ARRIVED
 from gelflow.real.runner.lab import Lab
 from gelflow.real.runner.motion_executor import LONGEST_UNOBSERVED, MotionExecutor
 from gelflow.real.runner.phases import Phase
-from gelflow.real.runner.progress import ARRIVED
 from gelflow.real.runner.touch.observer import TactileObserver, TactileReading
 from gelflow.session.recorder import SessionRecorder
 from gelflow.time_sync import RUNNER
@@ -121,8 +121,8 @@ class GuardedMotion:
         speed = self.speed_towards(target) if speed is None else speed
         # A mock robot's time waits for this loop: on a busy computer the arm would travel on before an image is seen.
         with self._clock.bounded(RUNNER) as renew:
-            self._motion.go(target, speed=speed, guarded=True)
-            progress = self._motion.progress(target)
+            self._motion.start_motion(target, speed=speed, guarded=True)
+            progress = self._motion.approach_monitor(target)
             while not self._motion.arrived(within=within):
                 renew()
                 self._motion.wait(0.0)
@@ -133,13 +133,13 @@ class GuardedMotion:
                     if on_reading(reading) or change > threshold:
                         self._motion.hold()
                         return Contact(reading, change)
-                if self.observer.blind_time() >= LONGEST_UNOBSERVED:
+                if self.observer.unreadable_time() >= LONGEST_UNOBSERVED:
                     self._motion.hold()
                     self._wait_until_readable()
-                    self._motion.go(target, speed=speed, guarded=True)
-                    progress = self._motion.progress(target)
-                elif not self._motion.observed(self.observer.blind_time()):  # this thread was delayed
-                    self._motion.go(target, speed=speed, guarded=True)
+                    self._motion.start_motion(target, speed=speed, guarded=True)
+                    progress = self._motion.approach_monitor(target)
+                elif not self._motion.report_observation(self.observer.unreadable_time()):  # this thread was delayed
+                    self._motion.start_motion(target, speed=speed, guarded=True)
                 progress.check()
                 self._check_deadline(deadline)
         return None
@@ -157,14 +157,14 @@ class GuardedMotion:
         phases = self._motion.supervisor.phases
         before = phases.phase
         phases.enter(Phase.HOLD)
-        values = {"camera": self.observer.blind_camera, "seconds": self.observer.blind_time()}
+        values = {"camera": self.observer.unreadable_camera, "seconds": self.observer.unreadable_time()}
         self._recorder.event("pad not readable", values)
-        begun = self._clock.now() - self.observer.blind_time()
-        while self.observer.blind_time() >= LONGEST_UNOBSERVED:
+        begun = self._clock.now() - self.observer.unreadable_time()
+        while self.observer.unreadable_time() >= LONGEST_UNOBSERVED:
             if (seconds := self._clock.now() - begun) > self._lab.limits.stale_frame:
                 raise TouchLost(
-                    f"camera {self.observer.blind_camera}: no readable image in time for {seconds:.2f} s with a part "
-                    "held, which is longer than limits.stale_frame; check the gel, its light and the camera"
+                    f"camera {self.observer.unreadable_camera}: no readable image in time for {seconds:.2f} s with a "
+                    "part held, which is longer than limits.stale_frame; check the gel, its light and the camera"
                 )
             self._motion.wait(0.0)
             with self._clock.bounded(RUNNER):

@@ -56,7 +56,7 @@ class TactileObserver:
     """Observes both pads relative to a reference, with new trackers; a pair of images is the reference.
 
     `stale` is the largest age of an image [s, robot time]. `on_result` receives the newest readable result of each
-    sensor, with its image, after the decision that it leads to: see `pass_on`.
+    sensor, with its image, after the decision that it leads to: see `publish_results`.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class TactileObserver:
         self._results: list[TrackingResult] = []
         self._readable: list[bool] = []
         self._on_result = on_result
-        self._not_passed_on: list[int] = []  # sensors whose newest result is readable and was not passed on
+        self._unpublished: list[int] = []  # sensors whose newest result is readable and was not passed on
         self._readable_stamps: list[float] = []  # of the newest readable image of each sensor [s]
         self._intervals: deque[float] = deque(maxlen=_PERIODS)
         self.tracked: list[list[int]] = [[] for _ in cameras]  # sequence numbers given to each tracker, in order
@@ -115,7 +115,7 @@ class TactileObserver:
         """
         if self.reference is None:
             raise UsageError("the observer has no reference yet: call start first")
-        self.pass_on()
+        self.publish_results()
         new = self._wait_for_images()
         for sensor, image in new:
             last = self._images[sensor]
@@ -129,21 +129,21 @@ class TactileObserver:
                 self._readable[sensor] = False
             if self._readable[sensor]:
                 self._readable_stamps[sensor] = image.stamp
-                self._not_passed_on.append(sensor)
+                self._unpublished.append(sensor)
         if not new or not all(self._readable):
             return None
         frame = self._frame()
         return TactileReading(frame, tuple(self._images), 0.0, mean_change(frame, self.reference.frame))
 
-    def pass_on(self) -> None:
+    def publish_results(self) -> None:
         """Call `on_result` for the results of the last update.
 
         `update` does so before it waits for the next image; a caller that ends its observation calls this itself.
         """
         if self._on_result is not None:
-            for sensor in self._not_passed_on:
+            for sensor in self._unpublished:
                 self._on_result(sensor, self._images[sensor], self._results[sensor])
-        self._not_passed_on = []
+        self._unpublished = []
 
     def update_pair(self, since: float) -> TactileReading | None:
         """Track until the newest image of each pad was received after the robot time `since` [s]; see `update`."""
@@ -165,7 +165,7 @@ class TactileObserver:
                 if reading is not None:
                     readings.append(reading)
                     since = min(image.stamp for image in reading.images)
-                elif self.blind_time() > self._stale:
+                elif self.unreadable_time() > self._stale:
                     raise MarkersUnreadable("the markers are not readable at rest; inspect the gels and their light")
         return readings
 
@@ -173,12 +173,12 @@ class TactileObserver:
         """Mean change of each pad at rest [mm], shape (sensors, 2); see `at_rest`."""
         return np.asarray(np.mean([reading.change for reading in self.at_rest(since)], axis=0))
 
-    def blind_time(self) -> float:
+    def unreadable_time(self) -> float:
         """Time since the older of the newest readable images of both pads [s, robot time]."""
         return self._clock.now() - min(self._readable_stamps)
 
     @property
-    def blind_camera(self) -> str:
+    def unreadable_camera(self) -> str:
         """Name of the camera whose newest readable image is the older one."""
         return self._cameras[int(np.argmin(self._readable_stamps))].name
 
@@ -211,11 +211,11 @@ class TactileObserver:
         frames = [tactile_frame(results, self._mounts, 0.0) for results in (moved, still)]
         return mean_change(*frames)
 
-    def keep(self, reading: TactileReading) -> None:
-        """Add a reading, with its depth, to those that `chosen` selects from."""
+    def add_reading(self, reading: TactileReading) -> None:
+        """Add a reading, with its depth, to those that `readings_at_depths` selects from."""
         self.readings.append(reading)
 
-    def chosen(self, depths: Sequence[float]) -> list[TactileReading]:
+    def readings_at_depths(self, depths: Sequence[float]) -> list[TactileReading]:
         """For each depth [m] the nearest reading; the last one for depths below the end of the descent.
 
         Raises MarkersUnreadable without a reading.

@@ -39,7 +39,7 @@ class Batch {
 
   int threads() const { return pool_.size(); }
   bool checks_params = true;                               // refuses wrong parameters (parameter_checks.hpp)
-  std::atomic<int> user{0};                                // of the bindings: who calls, 0 for nobody
+  std::atomic<int> calling_thread{0};                      // identifier of the thread inside a call; 0: none
   Interruption& interruption() { return *interruption_; }  // of the present call
   void reset(const std::uint8_t* which);                   // (N) flags, or null for all; parameters stay
   void step(const Controls<T>& u, int steps, const std::uint8_t* active);  // the controls are held for all steps

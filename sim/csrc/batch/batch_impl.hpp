@@ -120,11 +120,11 @@ template <class T>
 void Batch<T>::check_params(const std::uint8_t* active) {
   const std::size_t width = model->param_names.size();
   for (int e = 0; checks_params && e < n; ++e) {
-    T* const right = checked_params_.data() + e * width;
-    if (std::memcmp(right, params_of(e), width * sizeof(T)) == 0 || (active != nullptr && active[e] == 0)) continue;
+    T* const valid = checked_params_.data() + e * width;
+    if (std::memcmp(valid, params_of(e), width * sizeof(T)) == 0 || (active != nullptr && active[e] == 0)) continue;
     const std::string wrong = wrong_parameter(*model, params_of(e));
     if (!wrong.empty()) throw std::invalid_argument("environment " + std::to_string(e) + ": " + wrong);
-    std::copy_n(params_of(e), width, right);
+    std::copy_n(params_of(e), width, valid);
   }
 }
 

@@ -39,7 +39,7 @@ void contact_anchors_vjp(const Model& m, const T* params, const T& step_length, 
     V6<T> grad_pose = V6<T>::Zero(), grad_twist = V6<T>::Zero();
     anchors_vjp<T>(frame, w.candidates[n], contact_settings<T>(m, contact, params, anchors, anchored, step_length),
                    grad_next + contact.anchor, grad_pose, grad_twist, grad_anchor + contact.anchor);
-    pull_back<T>(w.jacobian, grad_pose, grad_twist, grad_q, grad_v);
+    contact_jacobian_vjp<T>(w.jacobian, grad_pose, grad_twist, grad_q, grad_v);
   }
 }
 

@@ -85,8 +85,8 @@ void subtract_contact_derivatives(const T& beta_h, const ContactSums<T>& sums, W
 // Transforms a wrench about the shape's origin, in its frame, to one about the world's origin.
 template <class T>
 V6<T> wrench_in_world(const PairFrame<T>& frame, const T* wrench) {
-  const V3<T> moment = frame.to_world * vec3(wrench), push = frame.to_world * vec3(wrench + 3);
-  return stack<T>(moment + cross<T>(frame.origin, push), push);
+  const V3<T> moment = frame.to_world * vec3(wrench), force = frame.to_world * vec3(wrench + 3);
+  return stack<T>(moment + cross<T>(frame.origin, force), force);
 }
 
 // Subtracts the impulses β h Sᵀ W from w.residual. `add_impulses`: adds their absolute values to w.impulses.

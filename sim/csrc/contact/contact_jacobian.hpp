@@ -59,8 +59,8 @@ void contact_jacobian(const PairDofs& pair, int first, const PairFrame<T>& f, Wo
 
 // Carries gradients with respect to the relative pose and twist to the generalized coordinates.
 template <class T>
-void pull_back(const ContactJacobian<T>& c, const V6<T>& grad_pose, const V6<T>& grad_twist, VX<T>& grad_q,
-               VX<T>& grad_v) {
+void contact_jacobian_vjp(const ContactJacobian<T>& c, const V6<T>& grad_pose, const V6<T>& grad_twist, VX<T>& grad_q,
+                          VX<T>& grad_v) {
   for (int i = 0; i < c.n; ++i) {
     const int dof = c.dofs->dof[i];
     if (dof < 0) continue;

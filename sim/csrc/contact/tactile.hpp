@@ -150,7 +150,7 @@ void read_markers_vjp(const Model& m, const T* params, const V3<T>* anchors, con
       read_pad_vjp<T>(pad, frame, contact_settings<T>(pad, s, params, anchors, anchored), grad_reading, grad_pad,
                       grad_pose, grad_twist);
       contact_jacobian<T>(pad.pairs[s], pad.mount.body, frame, w);
-      pull_back<T>(w.jacobian, grad_pose, grad_twist, grad_q, grad_v);
+      contact_jacobian_vjp<T>(w.jacobian, grad_pose, grad_twist, grad_q, grad_v);
     }
   }
 }
@@ -170,7 +170,7 @@ void marker_anchors_vjp(const Model& m, const T* params, const T& step_length, c
       anchors_vjp<T>(frame, pad.cloud, contact_settings<T>(pad, s, params, anchors, anchored, step_length),
                      grad_next + slot, grad_pose, grad_twist, grad_anchor + slot);
       contact_jacobian<T>(pad.pairs[s], pad.mount.body, frame, w);
-      pull_back<T>(w.jacobian, grad_pose, grad_twist, grad_q, grad_v);
+      contact_jacobian_vjp<T>(w.jacobian, grad_pose, grad_twist, grad_q, grad_v);
     }
   }
 }

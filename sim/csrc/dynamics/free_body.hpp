@@ -141,8 +141,8 @@ void free_bodies_vjp(const Model& m, const T* params, const StepStart<T>& start,
     if (!body.is_free || c == V3<T>::Zero()) continue;
     const int turn = m.joints[body.joint_begin].v + 3;
     const CenterVelocity<T> before = previous_center_velocity<T>(start, m.nv, turn, c, w);
-    const V3<T> push = as<T>(w.rotation[i]).transpose() * vec3(multipliers.data() + turn - 3);
-    const V3<T> grad_u = body.params.in(params).mass * (push + cross<T>(vec3(multipliers.data() + turn), c));
+    const V3<T> force = as<T>(w.rotation[i]).transpose() * vec3(multipliers.data() + turn - 3);
+    const V3<T> grad_u = body.params.in(params).mass * (force + cross<T>(vec3(multipliers.data() + turn), c));
     const V3<T> grad_velocity = before.inverse_rotation.transpose() * grad_u;
     grad_v_star.template segment<3>(turn) += cross<T>(c, grad_velocity - grad_u);
     if (start.history == nullptr) continue;

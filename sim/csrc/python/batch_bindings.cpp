@@ -51,7 +51,7 @@ std::uint64_t main_thread = 0;  // Python's; set when the module is loaded
 // meanwhile: an exception of a handler, as at Ctrl-C, ends the call.
 template <class T, class Work>
 void call(Batch<T>& b, const Work& work) {
-  const ExclusiveUse use(b.user);
+  const ExclusiveUse use(b.calling_thread);
   const bool handles_signals = PyThread_get_thread_ident() == main_thread;
   b.interruption().begin(!handles_signals ? std::function<bool()>() : [] {
     const py::gil_scoped_acquire acquire;

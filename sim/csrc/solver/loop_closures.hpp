@@ -71,18 +71,18 @@ void closure_sums(const LoopClosure& c, const LoopClosureParams<T>& p, const Clo
   if constexpr (derivatives) {
     std::fill(sums.values + ContactSums<T>::k_at, sums.values + ContactSums<T>::padded, T(0));
     const M3<T> arm = skew<T>(gap), one = M3<T>::Identity();
-    const M3<T> by_speed = -p.damping * one;
-    const M3<T> by_place = -p.stiffness * one - p.damping * skew<T>(spin);
+    const M3<T> by_velocity = -p.damping * one;
+    const M3<T> by_position = -p.stiffness * one - p.damping * skew<T>(spin);
     T *const k = sums.values + ContactSums<T>::k_at, *const d = sums.values + ContactSums<T>::d_at;
-    add_block<T>(d, 3, 3, by_speed);
-    add_block<T>(d, 3, 0, -by_speed * arm);
-    add_block<T>(d, 0, 3, arm * by_speed);
-    add_block<T>(d, 0, 0, -arm * by_speed * arm);
-    const M3<T> moment_by_place = arm * by_place - skew<T>(force);
-    add_block<T>(k, 3, 3, by_place);
-    add_block<T>(k, 3, 0, -by_place * arm);
-    add_block<T>(k, 0, 3, moment_by_place);
-    add_block<T>(k, 0, 0, -moment_by_place * arm);
+    add_block<T>(d, 3, 3, by_velocity);
+    add_block<T>(d, 3, 0, -by_velocity * arm);
+    add_block<T>(d, 0, 3, arm * by_velocity);
+    add_block<T>(d, 0, 0, -arm * by_velocity * arm);
+    const M3<T> moment_by_position = arm * by_position - skew<T>(force);
+    add_block<T>(k, 3, 3, by_position);
+    add_block<T>(k, 3, 0, -by_position * arm);
+    add_block<T>(k, 0, 3, moment_by_position);
+    add_block<T>(k, 0, 0, -moment_by_position * arm);
     if (!c.weld) return;
     // A small turn δ of the first body changes R by [δ]× R, and φ by ½ (tr R − R) δ.
     add_block<T>(k, 0, 0, -p.turn_stiffness * T(0.5) * (motion.turned.trace() * one - motion.turned));

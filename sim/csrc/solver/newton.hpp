@@ -9,7 +9,7 @@
 
 namespace gelflow {
 
-enum class Status : std::int32_t { ok = 0, newton = 1, not_finite = 2 };
+enum class Status : std::int32_t { ok = 0, not_converged = 1, not_finite = 2 };
 
 // √Σ (g_k / s_k)², the residual relative to impulses s; infinity if it is not finite.
 template <class T>
@@ -112,7 +112,7 @@ class NewtonSolver {
       const Convergence test = test_convergence(k);
       if (test.converged && polish_-- <= 0) return Status::ok;
       if (k == m_.max_iterations || iterations_ >= m_.max_step_iterations) {
-        return test.skips_check && test.within_tolerance ? Status::ok : Status::newton;
+        return test.skips_check && test.within_tolerance ? Status::ok : Status::not_converged;
       }
       compute_direction(test.reuses_jacobian && !test.converged);
       if (is_final(test)) {
@@ -124,7 +124,7 @@ class NewtonSolver {
       keep_best(k + 1 == full_steps && !test.converged);
       if (search && !at_floor_ && is_stalled(k, decreased)) break;
     }
-    return Status::newton;
+    return Status::not_converged;
   }
 
  private:

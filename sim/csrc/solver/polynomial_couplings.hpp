@@ -39,13 +39,13 @@ void subtract_polynomial_couplings(const Model& m, const T* params, const T& bet
       if (add_impulses) w.impulses[dofs[i]] += abs(slopes[i] * impulse);
     }
     if constexpr (derivatives) {
-      const T bend = at.curvature * v[c.leader_dof];  // −∂φ̇/∂q of the leader
+      const T slope_rate = at.curvature * v[c.leader_dof];  // −∂φ̇/∂q of the leader
       for (int i = 0; i < 2; ++i) {
         for (int j = 0; j < 2; ++j) {
           w.dg_dq(dofs[i], dofs[j]) += beta_h * stiffness * slopes[i] * slopes[j];
           w.dg_dv(dofs[i], dofs[j]) += beta_h * damping * slopes[i] * slopes[j];
         }
-        w.dg_dq(dofs[i], c.leader_dof) -= beta_h * damping * slopes[i] * bend;
+        w.dg_dq(dofs[i], c.leader_dof) -= beta_h * damping * slopes[i] * slope_rate;
       }
       w.dg_dq(c.leader_dof, c.leader_dof) -= at.curvature * impulse;
     }

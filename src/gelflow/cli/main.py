@@ -12,7 +12,7 @@ import io
 import os
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from types import ModuleType
 
 from gelflow import __version__
@@ -61,9 +61,18 @@ def command_module(name: str) -> ModuleType:
     return importlib.import_module(".".join(["gelflow.cli.commands", *path]))
 
 
-def _one_line(message: Warning | str, *_: object, **__: object) -> str:
-    """A warning without the line of code that raised it."""
-    return f"gelflow: {message}\n"
+def _warning_format() -> Callable[..., str]:
+    """Formats a warning as one line, without the line of code that raised it, and its repetitions as nothing."""
+    printed: set[str] = set()
+
+    def one_line(message: Warning | str, *_: object, **__: object) -> str:
+        text = f"gelflow: {message}\n"
+        if text in printed:
+            return ""
+        printed.add(text)
+        return text
+
+    return one_line
 
 
 def _prepare_streams() -> None:
@@ -106,7 +115,7 @@ def _run(arguments: Sequence[str], requested: str) -> int:
             module.configure(sub)
     args = parser.parse_args(arguments)
     assert module is not None
-    warnings.formatwarning = _one_line
+    warnings.formatwarning = _warning_format()
     try:
         status = int(module.run(args))
         sys.stdout.flush()

@@ -16,7 +16,7 @@ from gelflow.hardware_mocks.faults.injector import Devices, Occurrence
 from gelflow.hardware_mocks.faults.plan import Fault, FaultPlan
 from gelflow.hardware_mocks.robot import MockRobot, MockRobotConfig
 from gelflow.hardware_mocks.simulated_cell.cell import SimulatedCell, SimulatedCellConfig
-from gelflow.hardware_mocks.simulated_cell.progress import Progress
+from gelflow.hardware_mocks.simulated_cell.insertion_progress import InsertionProgress
 from gelflow.real.wsg.codec import Packet
 from gelflow.real.wsg.constants import Command
 from gelflow.task import INSERTION
@@ -92,7 +92,7 @@ def test_grip_friction_and_gel_stiffness_change_while_the_cell_runs() -> None:
 
 def test_a_momentary_fault_at_random_times_occurs_again_and_again() -> None:
     occurrence = Occurrence(0, Fault("gripper", "lose_part", rate=2.0, seed=1), INSERTION)
-    progress = Progress(started=0.0)
+    progress = InsertionProgress(started=0.0)
     times = [step / 100 for step in range(1000) if occurrence.begins(step / 100, progress)]
     assert 10 < len(times) < 35 and not occurrence.active
     lasting = Occurrence(0, Fault("gripper", "stall", rate=2.0, seed=1, duration=0.5), INSERTION)

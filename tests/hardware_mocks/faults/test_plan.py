@@ -11,7 +11,7 @@ from gelflow.hardware_mocks.faults.injector import event_occurred
 from gelflow.hardware_mocks.faults.plan import DEVICES, EVENTS, KINDS, Fault, FaultPlan
 from gelflow.hardware_mocks.faults.plan_file import load_fault_plan, plan_from_tables, plan_to_tables
 from gelflow.hardware_mocks.faults.random_plan import random_plan
-from gelflow.hardware_mocks.simulated_cell.progress import PHASES, Progress, ProgressMonitor
+from gelflow.hardware_mocks.simulated_cell.insertion_progress import PHASES, InsertionMonitor, InsertionProgress
 from gelflow.task import INSERTION
 
 
@@ -93,7 +93,7 @@ def test_a_plan_that_is_written_as_tables_is_read_back_equal() -> None:
 
 
 def test_events_come_in_the_order_of_an_insertion() -> None:
-    monitor = ProgressMonitor(INSERTION)
+    monitor = InsertionMonitor(INSERTION)
     seen: list[str] = []
     waiting = {event: Fault("arm", "stall", event=event) for event in EVENTS}
     waiting["second descent"] = Fault("arm", "stall", event="descent", attempt=2)
@@ -128,7 +128,7 @@ def test_events_come_in_the_order_of_an_insertion() -> None:
 
 
 def test_progress_is_the_same_after_shared_memory() -> None:
-    progress = Progress(1.0, 2.0, float(PHASES.index("gripped")), 0.03, 0.032, 2.0)
-    assert len(progress.to_words()) == Progress.WORDS
-    assert Progress.from_words(list(progress.to_words())) == progress
-    assert math.isnan(Progress().started) and progress.approaching
+    progress = InsertionProgress(1.0, 2.0, float(PHASES.index("gripped")), 0.03, 0.032, 2.0)
+    assert len(progress.to_words()) == InsertionProgress.WORDS
+    assert InsertionProgress.from_words(list(progress.to_words())) == progress
+    assert math.isnan(InsertionProgress().started) and progress.approaching

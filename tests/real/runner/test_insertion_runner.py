@@ -228,17 +228,17 @@ def test_a_guarded_motion_holds_when_its_caller_no_longer_observes_the_pads() ->
     clock, arm = SimpleNamespace(seconds=0.0), FakeArm()
     clock.now = lambda: clock.seconds
     motion = executor_of(InterruptedGripper(), clock, arm)
-    motion.go(Pose(np.array([0.0, 0.0, 0.1]), np.array([1.0, 0.0, 0.0, 0.0])), guarded=True)
+    motion.start_motion(Pose(np.array([0.0, 0.0, 0.1]), np.array([1.0, 0.0, 0.0, 0.0])), guarded=True)
     for clock.seconds in (0.2, 0.4, 0.6):
         motion._hold_unobserved(clock.seconds)
-        assert motion.observed(0.0) and arm.holds == 0
+        assert motion.report_observation(0.0) and arm.holds == 0
     clock.seconds = 0.9
     motion._hold_unobserved(clock.seconds)
-    assert arm.holds == 1 and not motion.observed(0.0)
-    motion.go(Pose(np.array([0.0, 0.0, 0.1]), np.array([1.0, 0.0, 0.0, 0.0])), guarded=True)
-    assert motion.observed(0.0)
+    assert arm.holds == 1 and not motion.report_observation(0.0)
+    motion.start_motion(Pose(np.array([0.0, 0.0, 0.1]), np.array([1.0, 0.0, 0.0, 0.0])), guarded=True)
+    assert motion.report_observation(0.0)
     motion.hold()  # for another reason, such as a lost part: the motion does not continue
-    assert motion.observed(0.0)
+    assert motion.report_observation(0.0)
 
 
 @pytest.mark.parametrize("reported", ["part lost", "idle", "error"])

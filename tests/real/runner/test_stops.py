@@ -65,7 +65,7 @@ def test_a_requested_stop_holds_the_arm_at_once_and_ends_the_run(robot: MockRobo
     wait_for(lambda: moving(robot), during=finish)
     executors[0].request_stop("the operator pressed stop")
     with pytest.raises(SafetyError, match="the operator pressed stop"):
-        executors[0].go(executors[0].pose(), guarded=True)
+        executors[0].start_motion(executors[0].pose(), guarded=True)
     with pytest.raises(SafetyError, match="stopped: the operator pressed stop"):
         finish()
     executors[0].request_stop("again")

@@ -19,7 +19,6 @@ from gelflow.measurement.startup import measure_startup
 from gelflow.measurement.timing import BenchmarkOptions, Report, Timing, Workload, load_note, speedup, time_interleaved
 from gelflow.sim.benchmark.speed.batch import measure_batch, perturb_stiffness
 from gelflow.sim.benchmark.speed.gradients import measure_gradients
-from gelflow.sim.benchmark.speed.growth import SWEEPS, exponent
 from gelflow.sim.benchmark.speed.markers import SHAPES, measure_markers
 from gelflow.sim.benchmark.speed.mujoco_sensor import MujocoRolling
 from gelflow.sim.benchmark.speed.redmax import MODULE, unavailable_reason
@@ -30,6 +29,7 @@ from gelflow.sim.benchmark.speed.rolling import (
     rolling_run,
     rolling_scene,
 )
+from gelflow.sim.benchmark.speed.scaling import SWEEPS, exponent
 from gelflow.sim.benchmark.speed.scenes import measure_scenes
 from gelflow.sim.benchmark.speed.timed_run import TIMED, check_accuracy, motion_run, simulator
 from gelflow.sim.scene import load_scene
@@ -58,13 +58,13 @@ def test_output_fits_the_terminal_and_one_file_holds_all_results(everything: tup
     for name in SIMULATED:
         assert record[name]["outside"] == []
         assert record[name]["title"] in out
-    assert (folder / "growth.png").read_bytes().startswith(b"\x89PNG")
+    assert (folder / "scaling.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_every_timed_run_has_an_accuracy_check(everything: tuple[Path, str]) -> None:
     record = json.loads((everything[0] / "bench.json").read_text("utf-8"))
     checks = [run["check"] for name in ("rolling", "scenes", "gradients", "batch") for run in record[name]["results"]]
-    checks += [size["check"] for sweep in record["growth"]["results"] for size in sweep["sizes"]]
+    checks += [size["check"] for sweep in record["scaling"]["results"] for size in sweep["sizes"]]
     for one in checks:
         assert one["holds"] and one["position"] <= 1e-6 and one["turn"] <= 1e-6 and one["force"] <= 1e-4
         assert one["iterations"] > 0 and one["end"] and len(one["force_sum"]) == 3

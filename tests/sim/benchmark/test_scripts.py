@@ -44,7 +44,7 @@ def test_script_writes_a_record(
 
 
 def test_pictures_are_drawn_from_the_committed_records(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    names = ("growth", "tracking", "mesh_distance", "order", "tradeoff_pushing")
+    names = ("scaling", "tracking", "mesh_distance", "convergence", "tradeoff_pushing")
     assert run("pictures", *names, "--out", str(tmp_path), monkeypatch=monkeypatch) == 0
     assert {path.stem for path in tmp_path.iterdir()} == set(names)
     assert all(path.read_bytes().startswith(b"\x89PNG") for path in tmp_path.iterdir())

@@ -14,7 +14,7 @@ from gelflow.cli.main import main
 from gelflow.errors import UsageError
 from gelflow.sim import _core
 from gelflow.sim.drawing.renderer import render
-from gelflow.sim.drawing.scene_drawing import Mark
+from gelflow.sim.drawing.scene_drawing import Polyline
 from gelflow.sim.reductions import TactileReduction, center_of_pressure, pad_forces
 from gelflow.sim.scene import load_scene
 from gelflow.sim.simulator import Simulator
@@ -46,7 +46,7 @@ CALLS: list[tuple[Callable[[Any], Any], str]] = [
     (lambda s: TactileReduction(np.zeros((1, 130, 3)), 5), "names must be the names of the rows, got 5"),  # type: ignore[arg-type]
     (lambda s: replace(s.scene, gravity=np.zeros(2)).build(), ".*a value has a wrong type or shape"),
     (lambda s: render(s, title=5), "title must be a string, got 5"),  # type: ignore[arg-type]
-    (lambda s: Mark(np.zeros((2, 3)), 5), "the label of a mark must be a string, got 5"),  # type: ignore[arg-type]
+    (lambda s: Polyline(np.zeros((2, 3)), 5), "the label of a polyline must be a string, got 5"),  # type: ignore[arg-type]
     (
         lambda s: torch_rollout(s, torch_state(s), torch.from_numpy(U).to_sparse()),
         "u must be a CPU tensor of torch.float64, got sparse torch.float64",

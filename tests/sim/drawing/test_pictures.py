@@ -12,7 +12,7 @@ from gelflow.sim.drawing.annotations import marker_colors, quantity, round_scale
 from gelflow.sim.drawing.camera import VIEWS, framing_camera
 from gelflow.sim.drawing.film import film_pictures, record_rollout
 from gelflow.sim.drawing.ray_caster import RayCaster, View
-from gelflow.sim.drawing.scene_drawing import Mark, scene_drawing
+from gelflow.sim.drawing.scene_drawing import Polyline, scene_drawing
 
 VERMILION = np.array([213, 94, 0])
 
@@ -99,22 +99,22 @@ def test_camera_frames_the_moving_bodies_from_every_view() -> None:
 def test_camera_frames_marks_as_well() -> None:
     """The goal of a box lies outside of the view of the box alone."""
     drawing = scene_drawing(gs.Simulator(gs.load_scene("pushing")))
-    goal = Mark(np.array([[0.4, -0.2, 0.0], [0.5, -0.2, 0.0]]), "goal")
+    goal = Polyline(np.array([[0.4, -0.2, 0.0], [0.5, -0.2, 0.0]]), "goal")
     inside = []
-    for marks in ([], [goal]):
-        camera = framing_camera([drawing], marks=marks)
+    for polylines in ([], [goal]):
+        camera = framing_camera([drawing], polylines=polylines)
         pixels, depth = View(camera, (200, 200), (100.0, 100.0)).project(goal.points)
         inside.append(bool((depth > 0).all() and (pixels > 0).all() and (pixels < 200).all()))
     assert inside == [False, True]
 
 
 def test_marks_are_lists_of_points() -> None:
-    assert Mark([[0, 0, 0], [0, 0, 1]], "goal").points.shape == (2, 3)  # type: ignore[arg-type]
+    assert Polyline([[0, 0, 0], [0, 0, 1]], "goal").points.shape == (2, 3)  # type: ignore[arg-type]
     for points in ([], np.zeros(3), [[0, 0]], [[0, 0, np.nan]]):
-        with pytest.raises(UsageError, match="points of a mark must be a list of"):
-            Mark(points, "goal")  # type: ignore[arg-type]
-    with pytest.raises(UsageError, match="marks must be a list of Mark"):
-        gs.render(gs.Simulator(gs.load_scene("pushing")), marks=[3])  # type: ignore[list-item]
+        with pytest.raises(UsageError, match="points of a polyline must be a list of"):
+            Polyline(points, "goal")  # type: ignore[arg-type]
+    with pytest.raises(UsageError, match="polylines must be a list of Polyline"):
+        gs.render(gs.Simulator(gs.load_scene("pushing")), polylines=[3])  # type: ignore[list-item]
 
 
 def test_film_has_one_camera_and_the_pictures_of_the_rollout() -> None:

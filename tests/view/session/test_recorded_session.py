@@ -1,4 +1,4 @@
-"""A recorded session at any time: markers relative to the start of the attempt, heights, marks, texts, pictures."""
+"""A recorded session at any time: markers relative to the start of the attempt, heights, events, texts, pictures."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -27,10 +27,10 @@ from gelflow.session import SessionRecorder, describe_session
 from gelflow.session.decision_replay import Comparison
 from gelflow.task import INSERTION
 from gelflow.view.session.curves import Curves, read_curves
-from gelflow.view.session.moment_text import comparison_text, moment_text
 from gelflow.view.session.pad_pictures import decision_picture, pads_picture
 from gelflow.view.session.recorded_session import RecordedSession
-from gelflow.view.session.time_line import HEIGHT, WIDTH, TimeLine
+from gelflow.view.session.snapshot_text import comparison_text, snapshot_text
+from gelflow.view.session.timeline import HEIGHT, WIDTH, Timeline
 
 
 @pytest.fixture(scope="module")
@@ -47,19 +47,21 @@ def session(path: Path) -> Iterator[RecordedSession]:
 
 
 def test_marks_are_the_attempts_decisions_and_warnings(session: RecordedSession) -> None:
-    found = [(m.kind, round(m.time - session.start, 2), round(m.end - session.start, 2)) for m in session.marks]
+    found = [
+        (m.kind, round(m.time - session.start, 2), round(m.end - session.start, 2)) for m in session.timeline_events
+    ]
     assert found == [
         ("not inserted", 3.0, 7.0),
         ("warning", 6.0, 6.0),
         ("decision", 7.0, 7.0),
         ("inserted", 8.5, 11.0),
     ]
-    assert session.marks[2].text == "decision: x +1.00 mm, y -2.00 mm, yaw +2.9°"
+    assert session.timeline_events[2].text == "decision: x +1.00 mm, y -2.00 mm, yaw +2.9°"
 
 
 def test_first_view_has_both_images_and_the_arm(session: RecordedSession) -> None:
-    moment = session.at(session.first_view, markers=False)
-    assert all(pad is not None for pad in moment.pads) and moment.joints is not None
+    snapshot = session.at(session.first_view, markers=False)
+    assert all(pad is not None for pad in snapshot.pads) and snapshot.joints is not None
     before = session.at(session.first_view - 1e-3, markers=False)
     assert before.joints is None or any(pad is None for pad in before.pads)
 
@@ -70,8 +72,8 @@ def test_markers_are_relative_to_the_start_of_the_attempt(
 ) -> None:
     for sensor in range(2):
         assert session.markers.shear(sensor, session.start + seconds + 1e-3) == pytest.approx(shear, abs=5e-3)
-    moment = session.at(session.start + seconds + 1e-3)
-    for pad in moment.pads:
+    snapshot = session.at(session.start + seconds + 1e-3)
+    for pad in snapshot.pads:
         assert pad is not None and pad.tracked is not None
         assert MOUNT.pixels_per_mm is not None
         along = np.nanmean(pad.tracked.displacement[:, 1]) / MOUNT.pixels_per_mm  # the tip is below
@@ -79,26 +81,26 @@ def test_markers_are_relative_to_the_start_of_the_attempt(
 
 
 def test_a_moment_is_what_was_recorded_last(session: RecordedSession) -> None:
-    moment = session.at(session.start + 6.55)
-    assert (moment.phase, moment.insertion, moment.attempt) == ("descend", 0, 0)
-    assert moment.part_held and moment.decision is None
-    assert moment.joints is not None and moment.flange is not None and session.cell is not None
+    snapshot = session.at(session.start + 6.55)
+    assert (snapshot.phase, snapshot.insertion, snapshot.attempt) == ("descend", 0, 0)
+    assert snapshot.part_held and snapshot.decision is None
+    assert snapshot.joints is not None and snapshot.flange is not None and session.cell is not None
     seconds = 6.5
     joints = joints_at(seconds)
-    np.testing.assert_allclose(moment.joints, joints, atol=1e-12)
+    np.testing.assert_allclose(snapshot.joints, joints, atol=1e-12)
     position, _ = forward(joints.tolist())
-    np.testing.assert_allclose(moment.flange.position, position, atol=1e-12)
-    assert moment.pads[0] is not None
-    assert moment.pads[0].stamp == pytest.approx(session.start + seconds, abs=1e-6)
+    np.testing.assert_allclose(snapshot.flange.position, position, atol=1e-12)
+    assert snapshot.pads[0] is not None
+    assert snapshot.pads[0].stamp == pytest.approx(session.start + seconds, abs=1e-6)
     later = session.at(session.start + 7.2)
     assert later.phase == "retreat" and later.attempt is None and later.decision is not None
 
 
 def test_height_is_that_of_the_lower_face_above_the_floor(session: RecordedSession) -> None:
-    moment = session.at(session.start + 6.55)
-    assert moment.flange is not None and session.cell is not None
-    gripper = session.cell.gripper(moment.flange).position[2]
-    assert session.cell.part_height(moment.flange) == pytest.approx(gripper - HOLE_HEIGHT - GRASP_HEIGHT)
+    snapshot = session.at(session.start + 6.55)
+    assert snapshot.flange is not None and session.cell is not None
+    gripper = session.cell.gripper(snapshot.flange).position[2]
+    assert session.cell.part_height(snapshot.flange) == pytest.approx(gripper - HOLE_HEIGHT - GRASP_HEIGHT)
 
 
 def test_curves_have_the_values_of_the_records(session: RecordedSession) -> None:
@@ -118,11 +120,11 @@ def test_curves_have_the_values_of_the_records(session: RecordedSession) -> None
 
 
 def test_text_states_numbers_and_differences(session: RecordedSession) -> None:
-    moment = session.at(session.start + 7.2)
-    text = moment_text(moment, session)
+    snapshot = session.at(session.start + 7.2)
+    text = snapshot_text(snapshot, session)
     for part in ("**7.20 s** of 11.9 s", "phase **retreat**", "35.00 mm, 12.0 N, holding", "x +1.00 mm, y -2.00 mm"):
         assert part in text
-    decision = moment.decision
+    decision = snapshot.decision
     assert decision is not None
     repeated = Comparison(decision, decision.observation, decision.action)
     assert comparison_text(repeated) == "replay: identical"
@@ -134,8 +136,8 @@ def test_pictures_show_displacements_and_the_present(session: RecordedSession) -
     rest, contact = (pads_picture(session.at(session.start + t).pads) for t in (4.0, 6.0))
     assert rest.shape == contact.shape
     assert (np.abs(rest.astype(int) - contact).max(-1) > 60).mean() > 0.01
-    line = TimeLine(
-        Curves(session.start, session.end), session.marks, origin=session.start, topics=session.index.topics()
+    line = Timeline(
+        Curves(session.start, session.end), session.timeline_events, origin=session.start, topics=session.index.topics()
     )
     early, late = (line.with_present(session.start + t) for t in (1.0, 9.0))
     assert early.shape == (HEIGHT, WIDTH, 3)
@@ -148,10 +150,10 @@ def test_pictures_show_displacements_and_the_present(session: RecordedSession) -
     assert decision_picture(Comparison(decision, decision.observation, decision.action), INSERTION.grid).std() > 5
 
 
-def test_time_line_has_axes_for_what_was_recorded() -> None:
+def test_timeline_has_axes_for_what_was_recorded() -> None:
     curves = Curves(0.0, 10.0)
     pictures = {
-        topics: TimeLine(curves, [], origin=0.0, topics=topics).with_present(5.0)
+        topics: Timeline(curves, [], origin=0.0, topics=topics).with_present(5.0)
         for topics in [(), ("/left/force",), ("/arm/pose",), ("/arm/pose", "/gripper/state")]
     }
     # Dark rows are the frames of axes: two for the events and for each of the curves.
@@ -174,7 +176,7 @@ def test_forces_of_the_pads_are_shown_where_they_are_recorded(tmp_path: Path) ->
         clock.time = 105.0
         recorder.event("insertion ended", {"number": 0})
     with RecordedSession(tmp_path / "forces.mcap") as session:
-        texts = [moment_text(session.at(time), session) for time in (100.05, 101.05, 101.85, 104.0)]
+        texts = [snapshot_text(session.at(time), session) for time in (100.05, 101.05, 101.85, 104.0)]
         assert "right pad: no contact" in texts[0] and "left pad" not in texts[0]
         assert "right pad: normal 5.00 ± 0.25 N, shear 0.50 N, sticks 80 ± 10 %" in texts[1]
         assert "**gross slip**" in texts[2]
@@ -186,7 +188,7 @@ def test_forces_of_the_pads_are_shown_where_they_are_recorded(tmp_path: Path) ->
         np.testing.assert_allclose(curves.normal[1].ordered()[1], 0.5 * np.arange(20))
         assert len(curves.gross_slip.samples) == 5
         drawn, empty = (
-            TimeLine(shown, [], origin=session.start, topics=session.index.topics()).with_present(100.0)
+            Timeline(shown, [], origin=session.start, topics=session.index.topics()).with_present(100.0)
             for shown in (curves, Curves(session.start, session.end))
         )
         assert (drawn != empty).any()
@@ -202,7 +204,7 @@ def test_forces_that_are_not_finite_are_shown(tmp_path: Path) -> None:
         }  # fmt: skip
         recorder.force(0, clock.time, force)
     with RecordedSession(tmp_path / "forces.mcap") as session:
-        assert "left pad: normal nan ± nan N, shear nan N, sticks nan ± nan %" in moment_text(
+        assert "left pad: normal nan ± nan N, shear nan N, sticks nan ± nan %" in snapshot_text(
             session.at(session.end), session
         )
 
@@ -214,7 +216,7 @@ def test_an_event_named_state_without_a_phase_is_no_phase(tmp_path: Path) -> Non
         recorder.event("state", {"temperature": 21.0})
         recorder.event("state", {"state": "descend"})
     with RecordedSession(tmp_path / "own.mcap") as session:
-        assert session.at(session.end).phase == "descend" and session.marks == []
+        assert session.at(session.end).phase == "descend" and session.timeline_events == []
 
 
 def test_links_of_the_arm_follow_each_other() -> None:
@@ -241,12 +243,12 @@ def test_what_a_session_lacks_is_stated_and_the_rest_is_shown(tmp_path: Path, mo
         recorder.event("stopped", {"reason": "test"})
     with RecordedSession(path) as session:
         assert session.cell is None
-        moment = session.at(session.end)
-        assert moment.pads[0] is not None and moment.pads[0].problem and moment.pads[1] is None
-        text = moment_text(moment, session)
+        snapshot = session.at(session.end)
+        assert snapshot.pads[0] is not None and snapshot.pads[0].problem and snapshot.pads[1] is None
+        text = snapshot_text(snapshot, session)
         assert "no robot is shown" in text and "no markers are shown" in text
-        assert pads_picture(moment.pads).ndim == 3
-        assert [mark.kind for mark in session.marks] == ["stop"]
+        assert pads_picture(snapshot.pads).ndim == 3
+        assert [event.kind for event in session.timeline_events] == ["stop"]
 
 
 def test_a_recording_of_track_starts_with_its_first_image(tmp_path: Path) -> None:
@@ -331,9 +333,9 @@ def test_a_session_that_is_being_recorded_grows(tmp_path: Path) -> None:
             recorder.attempt_end({"insertion": 0, "attempt": 0, "outcome": "inserted"})
             assert session.refresh()
             assert session.end == pytest.approx(7.0)
-            (mark,) = session.marks
-            assert mark.kind == "inserted"
-            assert (mark.time, mark.end) == pytest.approx((5.0, 7.0))
+            (event,) = session.timeline_events
+            assert event.kind == "inserted"
+            assert (event.time, event.end) == pytest.approx((5.0, 7.0))
             assert session.at(6.0).phase == "descend"
             recorder.close()
             session.refresh()

@@ -38,7 +38,7 @@ def serve(page: SessionPage, ended: threading.Event) -> threading.Thread:
 
 
 @needs_browser
-def test_a_drag_on_the_time_line_changes_images_and_poses(paths: list[Path], window: Browser) -> None:
+def test_a_drag_on_the_timeline_changes_images_and_poses(paths: list[Path], window: Browser) -> None:
     ended = threading.Event()
     with RecordedSession(paths[0]) as session:
         decision = session.decisions[0].value
@@ -57,7 +57,7 @@ def test_a_drag_on_the_time_line_changes_images_and_poses(paths: list[Path], win
                 after = window.picture()
                 changed = (np.abs(before.astype(int) - after).max(-1) > 40).sum(axis=0)
                 middle = changed.shape[0] // 2
-                assert changed[:540].sum() > 1000  # images and time line
+                assert changed[:540].sum() > 1000  # images and timeline
                 assert changed[560 : middle + 350].sum() > 100  # the arm
                 for expected in ("7.00 s of", "8.50 s of", "11.90 s of"):
                     window.press("Next")

@@ -28,9 +28,9 @@ MEASUREMENTS = {
     "precision": "single and double precision: errors and speed",
     "startup": "imports and gelflow --help in fresh processes",
     "tracking": "marker tracking: errors on images with known truth and speed, with Lucas-Kanade and dense flow",
-    "growth": "time over the number of bodies, contact points, markers and environments",
+    "scaling": "time over the number of bodies, contact points, markers and environments",
 }
-_LONG = ("tracking", "growth")  # measured only on request
+_LONG = ("tracking", "scaling")  # measured only on request
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -48,7 +48,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--paper-model", type=Path, metavar="FILE", help="tactile_pad.xml of the paper's simulator, if it is installed"
     )
-    add_out(parser, "folder for bench.json, and the pictures growth.png and tracking.png", folder=True)
+    add_out(parser, "folder for bench.json, and the pictures scaling.png and tracking.png", folder=True)
     add_json(parser)
 
 
@@ -109,8 +109,8 @@ def _measure(
     """Tables of a measurement; adds its pictures to `pictures`."""
     if name == "tracking":
         return _measure_tracking(options, pictures, curves=args.out is not None)
-    if name == "growth":
-        return [_measure_growth(options, pictures)]
+    if name == "scaling":
+        return [_measure_scaling(options, pictures)]
     if name == "startup":
         from gelflow.measurement.startup import measure_startup
 
@@ -120,15 +120,15 @@ def _measure(
     return [measure(options, **more)]
 
 
-def _measure_growth(options: "BenchmarkOptions", pictures: list[Callable[[Path], None]]) -> "Report":
-    from gelflow.sim.benchmark.speed.growth import measure_growth
+def _measure_scaling(options: "BenchmarkOptions", pictures: list[Callable[[Path], None]]) -> "Report":
+    from gelflow.sim.benchmark.speed.scaling import measure_scaling
 
-    report = measure_growth(options)
+    report = measure_scaling(options)
 
     def write(folder: Path) -> None:
-        from gelflow.sim.benchmark.speed.growth_picture import draw
+        from gelflow.sim.benchmark.speed.scaling_picture import draw
 
-        draw(report.results, folder / "growth.png")
+        draw(report.results, folder / "scaling.png")
 
     pictures.append(write)
     return report

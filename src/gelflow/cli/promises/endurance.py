@@ -233,7 +233,7 @@ def _move_and_track(cell: Cell, motion: MotionExecutor, end: float, images: list
     start = motion.pose()
     for up in itertools.cycle((True, False)):
         target = Pose(start.position + np.array([0.0, 0.0, _STROKE if up else 0.0]), start.quaternion)
-        motion.go(target, speed=_SPEED)
+        motion.start_motion(target, speed=_SPEED)
         while not motion.arrived():
             motion.wait(0.0)
             before = [len(tracked) for tracked in observer.tracked]

@@ -13,7 +13,7 @@ from pathlib import Path
 from gelflow.cli.promises.outcome import Outcome, conditions
 from gelflow.cli.promises.rig import Rig, Run, RunningRunner, end_after, far_seed, gripped, in_descent, near_seed
 from gelflow.hardware_mocks.robot import MockRobot
-from gelflow.hardware_mocks.simulated_cell.progress import Progress
+from gelflow.hardware_mocks.simulated_cell.insertion_progress import InsertionProgress
 from gelflow.hardware_mocks.simulated_cell.world import TaughtError, World
 from gelflow.session.reader import SessionReader
 from gelflow.session.recovery import recover
@@ -23,10 +23,10 @@ _SETTLING = 0.15  # from a hold to rest [s]
 
 Fault = Callable[[MockRobot], object]
 Scenario = Callable[[Path], Outcome]
-Moment = Callable[[Progress], bool]
+Condition = Callable[[InsertionProgress], bool]
 
 
-def robot_fault(fault: Fault, reason: str, *, when: Moment = in_descent, latches: bool = False) -> Scenario:
+def robot_fault(fault: Fault, reason: str, *, when: Condition = in_descent, latches: bool = False) -> Scenario:
     """Time from a fault of the robot to the hold, or with `latches` to the stop of the transmission [ms]."""
 
     def scenario(folder: Path) -> Outcome:
@@ -56,7 +56,7 @@ def interrupted(number: signal.Signals) -> Scenario:
     return scenario
 
 
-def blind(kind: str, *, when: Moment = in_descent) -> Scenario:
+def blind(kind: str, *, when: Condition = in_descent) -> Scenario:
     """Time from the last new image of a camera to the hold, after a fault of its images [ms]."""
 
     def scenario(folder: Path) -> Outcome:
@@ -173,7 +173,7 @@ def prompt(folder: Path) -> Outcome:
         rig = stack.enter_context(Rig(folder, seed=near_seed()))
         lab = replace(rig.lab, part=replace(rig.lab.part, presentation="prompt"))
 
-        def asked(progress: Progress) -> bool:
+        def asked(progress: InsertionProgress) -> bool:
             return "press Enter" in rig.output
 
         run = rig.run(lambda process: rig.robot.arm.motors(False), when=asked, lab=lab, stdin=theirs, limit=10.0)

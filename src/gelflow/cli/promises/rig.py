@@ -23,7 +23,7 @@ from gelflow.cli.mock_process import free_port
 from gelflow.errors import PeerError
 from gelflow.hardware_mocks.robot import MockRobot, MockRobotConfig
 from gelflow.hardware_mocks.simulated_cell.cell import SimulatedCellConfig
-from gelflow.hardware_mocks.simulated_cell.progress import PHASES, Progress
+from gelflow.hardware_mocks.simulated_cell.insertion_progress import PHASES, InsertionProgress
 from gelflow.hardware_mocks.simulated_cell.world import World
 from gelflow.protocols import CameraImage
 from gelflow.real.runner.lab import Lab, LimitsSettings
@@ -113,12 +113,12 @@ def _misalignment(seed: int) -> Any:
     return INSERTION.draw_misalignment(rng, 1)[0] / np.array(INSERTION.misalignment)
 
 
-def gripped(progress: Progress) -> bool:
+def gripped(progress: InsertionProgress) -> bool:
     """Whether the part is gripped."""
     return progress.phase == PHASES.index("gripped")
 
 
-def lower_than(height: float) -> Callable[[Progress], bool]:
+def lower_than(height: float) -> Callable[[InsertionProgress], bool]:
     """Whether the gripped part's lower face is below `height` [m]."""
     return lambda progress: gripped(progress) and progress.height < height
 
@@ -184,7 +184,7 @@ class Rig:
         self,
         fault: Callable[["RunningRunner"], object] = lambda process: None,
         *,
-        when: Callable[[Progress], bool] | None = None,
+        when: Callable[[InsertionProgress], bool] | None = None,
         lab: Lab | None = None,
         prelude: str = "",
         options: Sequence[str] = (),

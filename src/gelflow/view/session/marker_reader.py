@@ -13,7 +13,7 @@ from gelflow.perception.frames import CameraMount, decode_image, tactile_frame
 from gelflow.perception.tracker import MarkerTracker, TrackerConfig, TrackingResult
 from gelflow.session.records import SENSORS, described
 from gelflow.session.time_index import TimeIndex
-from gelflow.view.session.moment import PadImage
+from gelflow.view.session.snapshot import PadImage
 
 _REFERENCES = 64  # that are kept
 _TRIES = 5  # images that a tracker may start on

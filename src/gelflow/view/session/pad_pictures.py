@@ -12,7 +12,7 @@ from gelflow.perception.tracker import TrackingResult
 from gelflow.session.decision_picture import comparison_figure
 from gelflow.session.decision_replay import Comparison
 from gelflow.session.records import SENSORS
-from gelflow.view.session.moment import PadImage
+from gelflow.view.session.snapshot import PadImage
 
 Image = NDArray[np.uint8]
 HEIGHT = 560  # of the picture [px]

@@ -15,8 +15,8 @@ from gelflow.session.records import SENSORS
 from gelflow.session.time_index import TimeIndex
 from gelflow.view.robot.cell_geometry import CellGeometry
 from gelflow.view.session.marker_reader import MarkerReader
-from gelflow.view.session.marks import Mark, descents, marks, phases
-from gelflow.view.session.moment import Moment
+from gelflow.view.session.snapshot import Snapshot
+from gelflow.view.session.timeline_events import TimelineEvent, descents, phases, timeline_events
 
 _FORCE_AGE = 0.5  # of a force that is shown [s]
 _EVENT_TOPICS = ("/event", "/attempt", "/decision")
@@ -52,7 +52,7 @@ class RecordedSession:
         self.start = self.index.start  # robot time [s]
         if "task" not in self.description:  # of `gelflow track`, whose description has no time
             self.start = min((record.time for record in self._first_images()), default=self.start)
-        self.marks: list[Mark] = []
+        self.timeline_events: list[TimelineEvent] = []
         self.decisions: list[Record] = []
         self._event_records: list[Record] = []
         self._phases: list[tuple[float, str]] = []
@@ -116,7 +116,7 @@ class RecordedSession:
         self._phases = phases(of_topic["/event"])
         self._descents = descents(self._phases)
         self.decisions = of_topic["/decision"]
-        self.marks = marks(of_topic["/event"], of_topic["/attempt"], of_topic["/decision"])
+        self.timeline_events = timeline_events(of_topic["/event"], of_topic["/attempt"], of_topic["/decision"])
 
     def _description(self) -> Mapping[str, Any]:
         """The description of the session; empty for recordings of `gelflow track`."""
@@ -150,16 +150,16 @@ class RecordedSession:
             return self.start
         return min(self._descents[number - 1] + self._settle, time)
 
-    def at(self, time: float, *, markers: bool = True) -> Moment:
+    def at(self, time: float, *, markers: bool = True) -> Snapshot:
         """The measurements known at a robot time [s]; without `markers` the images are not tracked."""
         joints = self.index.latest("/arm/joints", time)
         flange = self.index.latest("/arm/pose", time)
         gripper = self.index.latest("/gripper/state", time)
         checks = self.index.latest("/checks", time)
         phase = bisect_right(self._phases, time, key=lambda entry: entry[0])
-        attempt = next((m for m in self.marks if m.end > m.time and m.time <= time <= m.end), None)
+        attempt = next((m for m in self.timeline_events if m.end > m.time and m.time <= time <= m.end), None)
         decision = next((r.value for r in reversed(self.decisions) if r.time <= time), None)
-        return Moment(
+        return Snapshot(
             time=time,
             pads=tuple(self.markers.pad(sensor, time, track=markers) for sensor in range(len(SENSORS))),
             joints=tuple(joints.value.values()) if joints is not None else None,

@@ -8,9 +8,9 @@ from gelflow.errors import UsageError
 from gelflow.session.decision_replay import Comparison
 from gelflow.view.page import DEFAULT_HOST, DEFAULT_PORT, Page
 from gelflow.view.page_events import PageEvents
-from gelflow.view.session.moment import Moment
 from gelflow.view.session.recorded_session import RecordedSession
 from gelflow.view.session.session_panel import SessionPanel
+from gelflow.view.session.snapshot import Snapshot
 
 _TICK = 0.04  # [s] of the loop of `run`
 _SPEEDS = ("0.1 ×", "0.25 ×", "1 ×", "4 ×", "16 ×")
@@ -25,7 +25,7 @@ _LONGEST_PAUSE = 1.0  # longest time between two of these pictures, on a busy ma
 
 
 class SessionPage:
-    """A page of recorded sessions with a time line that can be dragged.
+    """A page of recorded sessions with a timeline that can be dragged.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ class SessionPage:
         self._behind = False  # records have been added that are not shown yet
         self._next_follow = 0.0
         self._offsets = [0.0] * len(sessions)  # of the time of each session [s]
-        self._moments: list[Moment] = []
+        self._snapshots: list[Snapshot] = []
         same = len({session.name for session in sessions}) < len(sessions)
         self._names = [f"{s.reader.path.parent.name}/{s.name}" if same else s.name for s in sessions]
         self._duration = max(session.end - session.start for session in sessions)
@@ -154,7 +154,7 @@ class SessionPage:
             self._next_follow = now + min(max(_FOLLOW_PERIOD, pause), _LONGEST_PAUSE)
 
     def _extend(self) -> None:
-        """Extend the time line to the present end."""
+        """Extend the timeline to the present end."""
         whole = self._range == (0.0, self._duration)
         self._duration = max(panel.session.end - panel.session.start for panel in self._panels)
         if whole:
@@ -194,7 +194,7 @@ class SessionPage:
         """Choices that depend on the contents of the sessions."""
         gui = self._page.gui
         self._add_marks(gui)
-        shown = gui.add_dropdown("time line shows", _RANGES, initial_value=_RANGES[0])
+        shown = gui.add_dropdown("timeline shows", _RANGES, initial_value=_RANGES[0])
         shown.on_update(lambda event: self._post(self._show_range, event.target.value))
         if len(self._panels) == 2:
             align = gui.add_dropdown("same time at", (_FROM_START, *self._common_attempts()))
@@ -203,7 +203,7 @@ class SessionPage:
         markers.on_update(lambda event: self._post(self._set_markers, event.target.value))
 
     def _add_marks(self, gui: Any) -> None:
-        """The list of all marks of the first session, to jump to."""
+        """The list of all events of the first session, to jump to."""
         self._marks: dict[str, float] = {}
         self._chosen = gui.add_dropdown("go to", (_START,), initial_value=_START)
         self._chosen.on_update(self._mark_chosen)
@@ -212,8 +212,8 @@ class SessionPage:
     def _refresh_marks(self) -> None:
         first = self._panels[0]
         found = {
-            f"{mark.time - first.session.start:.2f} s {mark.text}": mark.time - first.session.start
-            for mark in first.marks
+            f"{event.time - first.session.start:.2f} s {event.text}": event.time - first.session.start
+            for event in first.events
         }
         if list(found) != list(self._marks):
             self._marks = found
@@ -278,7 +278,7 @@ class SessionPage:
         if self._shown == self.time:
             return False
         self._shown = self.time
-        self._moments = [
+        self._snapshots = [
             panel.show(panel.session.start + self.time + offset)
             for panel, offset in zip(self._panels, self._offsets, strict=True)
         ]
@@ -286,8 +286,8 @@ class SessionPage:
 
     def _settle(self) -> None:
         """Show what takes longer, while nothing moves."""
-        for panel, moment in zip(self._panels, self._moments, strict=True):
-            panel.show_decision(moment.decision)
+        for panel, snapshot in zip(self._panels, self._snapshots, strict=True):
+            panel.show_decision(snapshot.decision)
 
     def _jump(self, forward: bool) -> None:
         self._following = False
@@ -312,7 +312,7 @@ class SessionPage:
     def _attempt_range(self) -> tuple[float, float]:
         """The attempt of the first session at the present time, or the last before; without one the whole recording."""
         origin = self._panels[0].session.start
-        spans = [(m.time - origin, m.end - origin) for m in self._panels[0].marks if m.end > m.time]
+        spans = [(m.time - origin, m.end - origin) for m in self._panels[0].events if m.end > m.time]
         before = [span for span in spans if span[0] <= self.time]
         return before[-1] if before else spans[0] if spans else (0.0, self._duration)
 
@@ -331,7 +331,7 @@ class SessionPage:
 
 def _attempt_starts(panel: SessionPanel) -> dict[tuple[int | None, int | None], float]:
     """Starts of the attempts [s] since the start of the recording."""
-    return {(m.insertion, m.attempt): m.time - panel.session.start for m in panel.marks if m.end > m.time}
+    return {(m.insertion, m.attempt): m.time - panel.session.start for m in panel.events if m.end > m.time}
 
 
 def _attempt_name(key: tuple[int | None, int | None]) -> str:

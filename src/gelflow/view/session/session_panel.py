@@ -13,12 +13,12 @@ from gelflow.session.records import Decision
 from gelflow.view.page import Page
 from gelflow.view.robot.robot_view import RobotView
 from gelflow.view.session.curves import SAMPLES, Curves, read_curves
-from gelflow.view.session.marks import Mark
-from gelflow.view.session.moment import Moment
-from gelflow.view.session.moment_text import checks_text, moment_text
 from gelflow.view.session.pad_pictures import decision_picture, pads_picture
 from gelflow.view.session.recorded_session import RecordedSession
-from gelflow.view.session.time_line import HEIGHT, WIDTH, TimeLine
+from gelflow.view.session.snapshot import Snapshot
+from gelflow.view.session.snapshot_text import checks_text, snapshot_text
+from gelflow.view.session.timeline import HEIGHT, WIDTH, Timeline
+from gelflow.view.session.timeline_events import TimelineEvent
 
 _DECISION_PICTURES = 32  # that are kept
 _GROWTH = 1.0  # period in which curves of a growing session are extended [s]
@@ -28,14 +28,14 @@ _REDRAW = 5  # rounds of samples between two pictures of the curves
 
 
 class SessionPanel:
-    """Images, time line, text and robot of one session. All methods are for the thread of the page.
+    """Images, timeline, text and robot of one session. All methods are for the thread of the page.
 
     Parameters
     ----------
     page: where the panel is made
     panel: panel of viser that contains it
     session: the session
-    decision_panel: where the flow maps of decisions are shown; None: below the time line
+    decision_panel: where the flow maps of decisions are shown; None: below the timeline
     comparisons: the decisions of its replay; None: it is not replayed
     number: 0 for the first session of the page
     name: title of the panel
@@ -73,17 +73,17 @@ class SessionPanel:
                 self._checks = page.gui.add_markdown("")
         self._pictures: OrderedDict[tuple[int, int], Any] = OrderedDict()
         self._shown_decision: Decision | None = None
-        self._time_line: TimeLine | None = None
-        self._drawn: TimeLine | None = None
+        self._timeline: Timeline | None = None
+        self._drawn: Timeline | None = None
         self._time = session.start
         self._curves = Curves(session.start, session.end)
         self._reading = threading.Event()
         self._reader: threading.Thread | None = None
 
     @property
-    def marks(self) -> list[Mark]:
+    def events(self) -> list[TimelineEvent]:
         """Marks of the session, and of the differences of its replay."""
-        return sorted([*self.session.marks, *self._differences()], key=lambda mark: mark.time)
+        return sorted([*self.session.timeline_events, *self._differences()], key=lambda event: event.time)
 
     def show_range(self, start: float, end: float) -> None:
         """Read and draw the curves from `start` to `end` [s] in the background."""
@@ -93,19 +93,19 @@ class SessionPanel:
         self._reader = threading.Thread(target=self._read, args=(curves, self._reading), name="curves", daemon=True)
         self._reader.start()
 
-    def show(self, time: float) -> Moment:
+    def show(self, time: float) -> Snapshot:
         """Show the session at a robot time [s]: first what is known at once, then the markers."""
         self._time = time = min(max(time, self.session.start), self.session.end)
         if self.markers and not self.session.markers.is_ready():
             self._show(self.session.at(time, markers=False))
-        moment = self.session.at(time, markers=self.markers)
-        self._show(moment)
-        return moment
+        snapshot = self.session.at(time, markers=self.markers)
+        self._show(snapshot)
+        return snapshot
 
     def refresh(self) -> None:
         """Show what has been read in the background."""
-        if self._time_line is not self._drawn:
-            self._drawn = self._time_line
+        if self._timeline is not self._drawn:
+            self._drawn = self._timeline
             self._show_time()
 
     def show_decision(self, decision: Decision | None) -> None:
@@ -145,14 +145,14 @@ class SessionPanel:
         if self._robot is not None:
             self._robot.remove()
 
-    def _show(self, moment: Moment) -> None:
-        self._images.image = pads_picture(moment.pads, markers=self.markers)
+    def _show(self, snapshot: Snapshot) -> None:
+        self._images.image = pads_picture(snapshot.pads, markers=self.markers)
         if self._robot is not None:
-            width = None if moment.gripper is None else float(moment.gripper["width"])
-            self._robot.show(moment.joints, moment.flange, width, part_held=moment.part_held)
-        self._checks.content = checks_text(moment)
-        self._checks_folder.visible = bool(moment.checks)
-        self._text.content = moment_text(moment, self.session, comparison=self._comparison(moment.decision))
+            width = None if snapshot.gripper is None else float(snapshot.gripper["width"])
+            self._robot.show(snapshot.joints, snapshot.flange, width, part_held=snapshot.part_held)
+        self._checks.content = checks_text(snapshot)
+        self._checks_folder.visible = bool(snapshot.checks)
+        self._text.content = snapshot_text(snapshot, self.session, comparison=self._comparison(snapshot.decision))
         self._show_time()
 
     def _show_time(self) -> None:
@@ -182,12 +182,12 @@ class SessionPanel:
             ended.wait(_DRAWING_SHARE * (perf_counter() - begun))
 
     def _draw(self, curves: Curves) -> None:
-        self._time_line = TimeLine(curves, self.marks, origin=self.session.start, topics=self.session.index.topics())
+        self._timeline = Timeline(curves, self.events, origin=self.session.start, topics=self.session.index.topics())
 
     def _comparison(self, decision: Decision | None) -> Comparison | None:
         return None if decision is None else self._comparisons.get((decision.insertion, decision.attempt))
 
-    def _differences(self) -> list[Mark]:
+    def _differences(self) -> list[TimelineEvent]:
         """Marks of the decisions that the replay did not repeat."""
         found = []
         for record in self.session.decisions:
@@ -197,7 +197,7 @@ class SessionPanel:
                 text = f"the replay of insertion {key[0]}, attempt {key[1]} differs"
                 if comparison is None or comparison.skipped:
                     text = f"insertion {key[0]}, attempt {key[1]} could not be replayed"
-                found.append(Mark(record.time, record.time, "difference", text, *key))
+                found.append(TimelineEvent(record.time, record.time, "difference", text, *key))
         return found
 
 

@@ -53,12 +53,12 @@ def test_softer_gels_and_heavier_parts_do_not_raise_the_thresholds() -> None:
     [
         ([[0.056, 0.0], [0.0, 0.0]], "right camera: the pad shows no weight"),
         ([[0.0, 0.0], [0.056, 0.0]], "left camera: the pad shows no weight"),
-        ([[-0.056, 0.0], [0.056, 0.0]], "left camera: .* points [+-]180° away"),
-        ([[0.056, 0.0], [0.0, 0.056]], "right camera: .* points [+]90° away"),
+        ([[-0.056, 0.0], [0.056, 0.0]], "left camera: .* is [+-]180° from"),
+        ([[0.056, 0.0], [0.0, 0.056]], "right camera: .* is [+]90° from"),
         ([[0.0, 0.0], [0.0, 0.0]], "left camera: the pad shows no weight"),
-        ([[0.0, 0.056], [0.0, 0.056]], "left camera: .* points [+](89|90|91)° away"),
-        ([[0.0, 0.056], [0.0, -0.056]], "left camera: .* points [+](89|90|91)° away"),
-        ([[0.056, -0.07], [-0.056, -0.07]], "right camera: .* away"),
+        ([[0.0, 0.056], [0.0, 0.056]], "left camera: .* is [+](89|90|91)° from"),
+        ([[0.0, 0.056], [0.0, -0.056]], "left camera: .* is [+](89|90|91)° from"),
+        ([[0.056, -0.07], [-0.056, -0.07]], "right camera: .* from the direction to the fingertip"),
     ],
 )
 def test_pad_that_does_not_show_the_weight_is_refused(weight: list[list[float]], named: str) -> None:

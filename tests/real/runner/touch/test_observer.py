@@ -59,8 +59,8 @@ def test_results_are_passed_on_after_the_decision() -> None:
     cameras[0].show(0.2)
     assert observer.update() is not None
     assert passed == [(0, 1), (1, 1)]
-    observer.pass_on()  # at the end of an observation
-    observer.pass_on()
+    observer.publish_results()  # at the end of an observation
+    observer.publish_results()
     assert passed == [(0, 1), (1, 1), (0, 2)]
     assert [image.sequence for image in observer.newest_images] == [2, 1]
     for pad in rest:

@@ -1,4 +1,4 @@
-"""Picture of the scaling measurement (`gelflow bench growth --out FOLDER`)."""
+"""Picture of the scaling measurement (`gelflow bench scaling --out FOLDER`)."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from gelflow.figures import SERIES, save
-from gelflow.sim.benchmark.speed.growth import fitted_sizes
+from gelflow.sim.benchmark.speed.scaling import fitted_sizes
 
 # Title and label of the horizontal axis, and the sweeps with their names in the legend.
 _PANELS: tuple[tuple[str, str, dict[str, str]], ...] = (
@@ -21,7 +21,7 @@ _PANELS: tuple[tuple[str, str, dict[str, str]], ...] = (
 def draw(records: Sequence[Mapping[str, Any]], file: Path) -> None:
     """Draw step rates over size, with fitted power laws; one panel per quantity. Writes `file`.
 
-    `records` are the results of the report of `measure_growth`.
+    `records` are the results of the report of `measure_scaling`.
     """
     from matplotlib.figure import Figure  # deferred: slow to import
 

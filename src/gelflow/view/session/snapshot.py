@@ -23,7 +23,7 @@ class PadImage:
 
 
 @dataclass(frozen=True)
-class Moment:
+class Snapshot:
     """The measurements known at `time`; None where nothing was measured yet."""
 
     time: float  # robot time [s]

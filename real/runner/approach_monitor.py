@@ -14,7 +14,7 @@ _PROGRESS = 0.1  # reduction of the remaining motion that counts as progress, as
 _BLOCKED_AFTER = 3.0  # without progress [s]
 
 
-class Progress:
+class ApproachMonitor:
     """Progress of a motion to `target`; `pose` gives the measured pose, `hold` ends the motion.
 
     The controller may follow more slowly than the reference may move (MaxSpeedDeviation), so the duration of a motion

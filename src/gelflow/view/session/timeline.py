@@ -1,4 +1,4 @@
-"""The picture of a session's time line: curves, attempts and events over time, and the present as a line."""
+"""The picture of a session's timeline: curves, attempts and events over time, and the present as a line."""
 
 from collections.abc import Collection, Sequence
 from typing import Any
@@ -8,14 +8,14 @@ from numpy.typing import NDArray
 
 from gelflow.figures import BLUE, GREEN, ORANGE, PURPLE, VERMILION, rasterize
 from gelflow.view.session.curves import ARM, FORCES, GRIPPER, Curve, Curves
-from gelflow.view.session.marks import Mark
+from gelflow.view.session.timeline_events import TimelineEvent
 
 Image = NDArray[np.uint8]
 WIDTH, HEIGHT = 640, 310  # [px]
 _LEGEND_ROOM = 0.35  # above the curves of shear, in heights of the curves
 _PRESENT = np.array((0, 0, 0), dtype=np.uint8)
 _SPANS = {"inserted": (GREEN, ""), "not inserted": (ORANGE, "//")}  # colour and hatch of attempts
-_POINTS = {  # colour, symbol and name of marks without a duration
+_POINTS = {  # colour, symbol and name of events without a duration
     "decision": (BLUE, "D", "decision"),
     "difference": (VERMILION, "X", "replay differs"),
     "warning": (PURPLE, "v", "warning"),
@@ -23,17 +23,19 @@ _POINTS = {  # colour, symbol and name of marks without a duration
 }
 
 
-class TimeLine:
-    """The time line of curves and marks; `with_present` draws the present into it.
+class Timeline:
+    """The timeline of curves and events; `with_present` draws the present into it.
 
     Parameters
     ----------
-    curves, marks: to draw
+    curves, events: to draw
     origin: robot time that is 0 on the axis [s]
     topics: of the session; curves whose topics are missing get no axis
     """
 
-    def __init__(self, curves: Curves, marks: Sequence[Mark], *, origin: float, topics: Collection[str]) -> None:
+    def __init__(
+        self, curves: Curves, events: Sequence[TimelineEvent], *, origin: float, topics: Collection[str]
+    ) -> None:
         from matplotlib.figure import Figure  # deferred: slow to import
 
         figure = Figure(figsize=(WIDTH / 100, HEIGHT / 100), dpi=100)
@@ -43,14 +45,14 @@ class TimeLine:
             _draw_shear,
             *([_draw_forces] if {GRIPPER, *FORCES} & set(topics) else []),
         ]
-        events, *axes = figure.subplots(
+        bars, *axes = figure.subplots(
             1 + len(rows), 1, sharex=True, height_ratios=(0.18 * len(rows), *(1 for _ in rows))
         )
         self._start, self._end = curves.start, curves.end
-        events.set_xlim(curves.start - origin, max(curves.end, curves.start + 1e-3) - origin)
-        inside = [mark for mark in marks if mark.end >= curves.start and mark.time <= curves.end]
-        _draw_marks(events, inside, origin)
-        handles, labels = events.get_legend_handles_labels()
+        bars.set_xlim(curves.start - origin, max(curves.end, curves.start + 1e-3) - origin)
+        inside = [event for event in events if event.end >= curves.start and event.time <= curves.end]
+        _draw_events(bars, inside, origin)
+        handles, labels = bars.get_legend_handles_labels()
         if labels:
             figure.legend(handles, labels, loc="upper right", fontsize=7, ncols=len(labels), frameon=False, borderpad=0)
         for draw, axis in zip(rows, axes, strict=True):
@@ -59,7 +61,7 @@ class TimeLine:
             axis.tick_params(labelsize=7)
             draw(axis, curves, origin)
         axes[-1].set_xlabel("time since the start of the recording [s]", fontsize=7)
-        figure.align_ylabels([events, *axes])
+        figure.align_ylabels([bars, *axes])
         self._picture: Image = rasterize(figure)
         box = axes[0].get_window_extent()
         self._left, self._right = float(box.x0), float(box.x1)
@@ -106,28 +108,28 @@ def _draw_forces(axis: Any, curves: Curves, origin: float) -> None:
     axis.legend(loc="upper left", fontsize=6, ncols=4, framealpha=0.7)
 
 
-def _shade(axis: Any, marks: Sequence[Mark], origin: float) -> None:
-    for mark in marks:
-        if mark.kind in _SPANS:
-            axis.axvspan(mark.time - origin, mark.end - origin, color=_SPANS[mark.kind][0], alpha=0.12, linewidth=0)
+def _shade(axis: Any, events: Sequence[TimelineEvent], origin: float) -> None:
+    for event in events:
+        if event.kind in _SPANS:
+            axis.axvspan(event.time - origin, event.end - origin, color=_SPANS[event.kind][0], alpha=0.12, linewidth=0)
 
 
-def _draw_marks(axis: Any, marks: Sequence[Mark], origin: float) -> None:
-    """Attempts as bars, other marks as symbols above them."""
+def _draw_events(axis: Any, events: Sequence[TimelineEvent], origin: float) -> None:
+    """Attempts as bars, other events as symbols above them."""
     axis.set(ylim=(0, 2.2), yticks=[], ylabel="events")
     axis.yaxis.label.set_fontsize(7)
     axis.tick_params(bottom=False, labelbottom=False)
     named: set[str] = set()
-    for mark in marks:
-        label: str | None = None if mark.kind in named else mark.kind
-        if mark.kind in _SPANS:
-            color, hatch = _SPANS[mark.kind]
+    for event in events:
+        label: str | None = None if event.kind in named else event.kind
+        if event.kind in _SPANS:
+            color, hatch = _SPANS[event.kind]
             axis.barh(
-                0.5, mark.end - mark.time, left=mark.time - origin, height=0.8, color=color, hatch=hatch,
+                0.5, event.end - event.time, left=event.time - origin, height=0.8, color=color, hatch=hatch,
                 edgecolor="white", linewidth=0.5, label=label,
             )  # fmt: skip
         else:
-            color, symbol, name = _POINTS[mark.kind]
-            label = None if mark.kind in named else name
-            axis.plot(mark.time - origin, 1.55, symbol, color=color, markersize=5, label=label, linestyle="none")
-        named.add(mark.kind)
+            color, symbol, name = _POINTS[event.kind]
+            label = None if event.kind in named else name
+            axis.plot(event.time - origin, 1.55, symbol, color=color, markersize=5, label=label, linestyle="none")
+        named.add(event.kind)

@@ -1,4 +1,4 @@
-"""Attempts, decisions and other events of a session as marks on its time line."""
+"""The events on the timeline of a session: attempts, decisions, warnings and stops."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ _DESCEND = "descend"  # phase with which an attempt starts
 
 
 @dataclass(frozen=True)
-class Mark:
+class TimelineEvent:
     """An event, or an attempt from `time` to `end` [s]."""
 
     time: float
@@ -44,17 +44,19 @@ def correction_text(action: NDArray[np.float64], digits: int = 2) -> str:
     return f"x {dx:+.{digits}f} mm, y {dy:+.{digits}f} mm, yaw {yaw:+.{digits - 1}f}°"
 
 
-def marks(events: Sequence[Record], attempts: Sequence[Record], decisions: Sequence[Record]) -> list[Mark]:
-    """All marks of a session, in order of time."""
-    found = [*_attempts(attempts, phases(events)), *_events(events)]
+def timeline_events(
+    events: Sequence[Record], attempts: Sequence[Record], decisions: Sequence[Record]
+) -> list[TimelineEvent]:
+    """All events of a session, in order of time."""
+    found = [*_attempts(attempts, phases(events)), *_warnings_and_stops(events)]
     for record in decisions:
         decision = record.value
         text = f"decision: {correction_text(decision.action)}"
-        found.append(Mark(record.time, record.time, "decision", text, decision.insertion, decision.attempt))
-    return sorted(found, key=lambda mark: mark.time)
+        found.append(TimelineEvent(record.time, record.time, "decision", text, decision.insertion, decision.attempt))
+    return sorted(found, key=lambda event: event.time)
 
 
-def _attempts(attempts: Sequence[Record], run: Sequence[tuple[float, str]]) -> Iterable[Mark]:
+def _attempts(attempts: Sequence[Record], run: Sequence[tuple[float, str]]) -> Iterable[TimelineEvent]:
     """An attempt lasts from the descent before its record to the record."""
     starts = descents(run)
     for record in attempts:
@@ -64,10 +66,10 @@ def _attempts(attempts: Sequence[Record], run: Sequence[tuple[float, str]]) -> I
         insertion, attempt = values.get("insertion"), values.get("attempt")
         text = f"insertion {insertion}, attempt {attempt}: {outcome}"
         kind: Kind = "inserted" if outcome == "inserted" else "not inserted"
-        yield Mark(start, record.time, kind, text, insertion, attempt)
+        yield TimelineEvent(start, record.time, kind, text, insertion, attempt)
 
 
-def _events(events: Sequence[Record]) -> Iterable[Mark]:
+def _warnings_and_stops(events: Sequence[Record]) -> Iterable[TimelineEvent]:
     for record in events:
         name, values = str(record.value["name"]), record.value["values"]
         if name == "arm stopped":
@@ -75,4 +77,4 @@ def _events(events: Sequence[Record]) -> Iterable[Mark]:
         if name in ERRORS or name in WARNINGS:
             text = event_text(name, values)
             text = text if len(text) <= _LONGEST else text[: _LONGEST - 1] + "…"
-            yield Mark(record.time, record.time, "stop" if name in ERRORS else "warning", text)
+            yield TimelineEvent(record.time, record.time, "stop" if name in ERRORS else "warning", text)

@@ -188,7 +188,7 @@ SWEEPS = (
 def measure_sweep(sweep: Sweep, options: BenchmarkOptions) -> SweepResult:
     """Time a sweep."""
     sizes = sweep.quick if options.quick else sweep.sizes
-    options.progress.begin(f"growth: {sweep.unit}", len(sizes) * (options.repeats + 2))
+    options.progress.begin(f"scaling: {sweep.unit}", len(sizes) * (options.repeats + 2))
     workloads, checks = [], []
     for size in sizes:
         work, accuracy = sweep.prepare(size)
@@ -199,8 +199,8 @@ def measure_sweep(sweep: Sweep, options: BenchmarkOptions) -> SweepResult:
     return SweepResult(sweep, sizes, times, checks, exponent(sizes, [t.median for t in times]))
 
 
-def measure_growth(options: BenchmarkOptions) -> Report:
-    """Time all sweeps. `growth_picture.draw` draws the results of the report."""
+def measure_scaling(options: BenchmarkOptions) -> Report:
+    """Time all sweeps. `scaling_picture.draw` draws the results of the report."""
     sweeps = [measure_sweep(sweep, options) for sweep in SWEEPS]
     rows, records, violations = [], [], []
     for result in sweeps:
@@ -224,9 +224,9 @@ def measure_growth(options: BenchmarkOptions) -> Report:
             }
         )
         for size, accuracy in zip(sizes, result.checks, strict=True):
-            violations += accuracy.violations(f"growth, {size} {name}")
+            violations += accuracy.violations(f"scaling, {size} {name}")
     return Report(
-        name="growth",
+        name="scaling",
         title="Growth: steps per second",
         columns=("number of", "from - to", "first", "middle", "last", "time ~ n^"),
         rows=rows,

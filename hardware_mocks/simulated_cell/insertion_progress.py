@@ -13,8 +13,8 @@ PHASES = ("none", "presented", "gripped", "released")
 
 
 @dataclass
-class Progress:
-    """Progress of the present part. Heights are those of the lower face above the taught hole, as the robot knows."""
+class InsertionProgress:
+    """Progress of an insertion. Heights are those of the lower face above the taught hole, as the robot knows it."""
 
     WORDS: ClassVar[int] = 6  # in shared memory
     time: float = 0.0  # of the simulation [s]
@@ -39,13 +39,13 @@ class Progress:
         return self.phase == PHASES.index("gripped") and not abs(self.height - self.gripped_at) < _APPROACHING
 
 
-class ProgressMonitor:
+class InsertionMonitor:
     """Follows the progress from the state of the cell after each step."""
 
     def __init__(self, task: InsertionTask) -> None:
         self._start_height = task.start_height
         self._above = True  # the arm has been at the start height since the last descent
-        self.progress = Progress()
+        self.progress = InsertionProgress()
 
     def update(self, time: float, phase: str, height: float) -> None:
         """Note the phase of the part and the height of the gripper's lower face above the taught hole [m]."""

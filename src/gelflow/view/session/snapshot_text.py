@@ -1,4 +1,4 @@
-"""A moment of a session in words."""
+"""A snapshot of a session in words."""
 
 import math
 from collections.abc import Mapping
@@ -7,33 +7,33 @@ from typing import Any
 from gelflow.geometry import Pose
 from gelflow.session.decision_replay import Comparison
 from gelflow.session.records import SENSORS
-from gelflow.view.session.marks import correction_text
-from gelflow.view.session.moment import Moment
 from gelflow.view.session.recorded_session import RecordedSession
+from gelflow.view.session.snapshot import Snapshot
+from gelflow.view.session.timeline_events import correction_text
 
 
-def moment_text(moment: Moment, session: RecordedSession, *, comparison: Comparison | None = None) -> str:
+def snapshot_text(snapshot: Snapshot, session: RecordedSession, *, comparison: Comparison | None = None) -> str:
     """The state of run, arm, gripper and policy, as Markdown; `comparison` is that of the last decision."""
-    since = moment.time - session.start
+    since = snapshot.time - session.start
     lines = [f"**{since:.2f} s** of {session.end - session.start:.1f} s"]
-    if moment.phase:
-        lines[0] += f", phase **{moment.phase}**"
-    if moment.insertion is not None:
-        lines[0] += f", insertion {moment.insertion}, attempt {moment.attempt}"
-    if moment.flange is not None and session.cell is not None:
-        lines.append(arm_text(session.cell.gripper(moment.flange), session.cell.part_height(moment.flange)))
-    if moment.gripper is not None:
-        lines.append(gripper_text(moment))
+    if snapshot.phase:
+        lines[0] += f", phase **{snapshot.phase}**"
+    if snapshot.insertion is not None:
+        lines[0] += f", insertion {snapshot.insertion}, attempt {snapshot.attempt}"
+    if snapshot.flange is not None and session.cell is not None:
+        lines.append(arm_text(session.cell.gripper(snapshot.flange), session.cell.part_height(snapshot.flange)))
+    if snapshot.gripper is not None:
+        lines.append(gripper_text(snapshot))
     lines += [
         f"{sensor} pad: {force_text(force)}"
-        for sensor, force in zip(SENSORS, moment.forces, strict=False)
+        for sensor, force in zip(SENSORS, snapshot.forces, strict=False)
         if force is not None
     ]
-    if any(pad is not None and pad.tracked is not None for pad in moment.pads):
-        reference = session.reference_time(moment.time) - session.start
+    if any(pad is not None and pad.tracked is not None for pad in snapshot.pads):
+        reference = session.reference_time(snapshot.time) - session.start
         lines.append(f"markers: displacement since {reference:.2f} s, lines 5 times as long")
-    if moment.decision is not None:
-        lines.append(_decision_text(moment))
+    if snapshot.decision is not None:
+        lines.append(_decision_text(snapshot))
     if comparison is not None:
         lines.append(comparison_text(comparison))
     lines += session.notes
@@ -51,9 +51,9 @@ def arm_text(gripper: Pose, height: float) -> str:
     )
 
 
-def gripper_text(moment: Moment) -> str:
+def gripper_text(snapshot: Snapshot) -> str:
     """Width, force and grasp of the gripper in words."""
-    gripper = moment.gripper or {}
+    gripper = snapshot.gripper or {}
     text = f"grip: {1e3 * float(gripper['width']):.2f} mm, {float(gripper['force']):.1f} N, {gripper['grasp']}"
     return text + (f", **fault: {gripper['fault']}**" if gripper.get("fault") else "")
 
@@ -85,8 +85,8 @@ def comparison_text(comparison: Comparison) -> str:
     return f"**replay differs**: correction {correction_text(comparison.action, 3)}; flow map {flow}"
 
 
-def _decision_text(moment: Moment) -> str:
-    decision = moment.decision
+def _decision_text(snapshot: Snapshot) -> str:
+    decision = snapshot.decision
     assert decision is not None
     return (
         f"last decision (insertion {decision.insertion}, attempt {decision.attempt}): "
@@ -94,11 +94,11 @@ def _decision_text(moment: Moment) -> str:
     )
 
 
-def checks_text(moment: Moment) -> str:
+def checks_text(snapshot: Snapshot) -> str:
     """The state of every check of the run, as Markdown; those that fail first."""
-    if not moment.checks:
+    if not snapshot.checks:
         return ""
-    failed = [f"**{check['name']}: {check['text']}**" for check in moment.checks if not check["ok"]]
-    good = [f"{check['name']}: {check['text']}" for check in moment.checks if check["ok"]]
-    head = f"**{len(failed)} of {len(moment.checks)} checks fail**" if failed else f"all {len(good)} checks pass"
+    failed = [f"**{check['name']}: {check['text']}**" for check in snapshot.checks if not check["ok"]]
+    good = [f"{check['name']}: {check['text']}" for check in snapshot.checks if check["ok"]]
+    head = f"**{len(failed)} of {len(snapshot.checks)} checks fail**" if failed else f"all {len(good)} checks pass"
     return "  \n".join([head, *failed, *good])

@@ -27,9 +27,11 @@ from gelflow.sim.validation.studies.schemes import ball_errors
 
 
 def main() -> int:
-    parser = script.parser("Measure the convergence of whole scenes.", out="order.json", quick="three halvings fewer")
+    parser = script.parser(
+        "Measure the convergence of whole scenes.", out="convergence.json", quick="three halvings fewer"
+    )
     parser.add_argument("--threads", type=int, default=os.cpu_count() or 1, help="concurrent runs (%(default)s)")
-    parser.add_argument("--picture", type=Path, default=script.PICTURES / "order.png", metavar="FILE")
+    parser.add_argument("--picture", type=Path, default=script.PICTURES / "convergence.png", metavar="FILE")
     args = parser.parse_args()
     with script.progress("scenes") as advance:
         found, ends = measure(3 if args.quick else 0, args.threads, advance)
