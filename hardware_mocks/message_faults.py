@@ -103,6 +103,12 @@ class MessageFaults:
             messages = [changed for timed in messages for changed in fault.apply(timed)]
         self._add(messages)
 
+    def clear(self) -> None:
+        """Drop the messages that wait; the faults stay active."""
+        for fault in self._active.values():
+            fault.flush()
+        self._queue = []
+
     def take(self, now: float) -> list[bytes]:
         """The messages that are due, in the order in which they arrive."""
         ready = [message for due, message in self._queue if due <= now]

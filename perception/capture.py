@@ -22,6 +22,7 @@ Image = NDArray[np.uint8]
 _PORTS = {"http": 80, "https": 443, "rtsp": 554, "rtmp": 1935}  # default ports of the protocols over TCP
 _MISSING, _MISSING_SHARE = 2, 0.02  # images at the end of a video that its container may announce in excess
 _ROUNDING = 1.001e-3  # largest error of the time of an image in a video with an even rate [s]
+_SMALLEST_STEP = 0.01  # between the stamps of two images of a video, relative to the interval of its rate
 _LARGEST_INT = 2**31 - 1  # that OpenCV takes as the number of a camera
 _BACKLOG = 8  # live images that wait for the program
 # Silences FFmpeg; OpenCV reads the variable at the first use of FFmpeg.
@@ -66,15 +67,13 @@ class Capture:
         capture = self._open()
         rate = capture.get(cv2.CAP_PROP_FPS)
         rate = rate if 0.1 <= rate <= 1000 else self.rate
-        expected, number, seconds, first = capture.get(cv2.CAP_PROP_FRAME_COUNT), 0, 0.0, 0.0
+        expected, number, seconds = capture.get(cv2.CAP_PROP_FRAME_COUNT), 0, 0.0
+        stamps = _VideoStamps(rate)
         try:
             while (image := _read(capture)) is not None:
                 stated = capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3
-                first = first if number else stated
-                # The rate may be uneven. Some containers round the time of an image to milliseconds.
-                uneven = stated > seconds and abs(stated - first - number / rate) > _ROUNDING
                 seconds = max(seconds, stated)
-                yield CapturedImage(image, stated - first if uneven else number / rate)
+                yield CapturedImage(image, stamps.next(stated))
                 number += 1
         finally:
             capture.release()
@@ -181,6 +180,37 @@ class Capture:
             raise PeerError(f"{self.text} cannot be read: {error.strerror}") from None
         if start and b"\0" not in start and _is_text(start):
             raise PeerError(f"{self.text} is a text file, not an image or a video")
+
+
+@dataclass
+class _VideoStamps:
+    """The increasing time stamps [s] of the images of a video.
+
+    They follow the rate until the times of the container show that it is uneven, and then these times. Containers
+    without times state 0 for every image.
+    """
+
+    rate: float  # [Hz]
+    _number: int = 0  # of the next image
+    _first: float = 0.0  # time of the first image in the container [s]
+    _latest: float = 0.0  # latest time in the container [s]
+    _uneven: bool = False
+    _stamp: float = 0.0  # of the last image
+
+    def next(self, stated: float) -> float:
+        """The stamp of the next image, whose time in the container is `stated`."""
+        if self._number == 0:
+            self._first = self._latest = stated
+        even, own = self._number / self.rate, stated - self._first
+        # Some containers round times to milliseconds.
+        self._uneven |= stated > self._latest and abs(own - even) > _ROUNDING
+        self._latest = max(self._latest, stated)
+        stamp = own if self._uneven else even
+        if self._number:  # several images may have the same millisecond
+            stamp = max(stamp, self._stamp + _SMALLEST_STEP / self.rate)
+        self._number += 1
+        self._stamp = stamp
+        return stamp
 
 
 def _read(capture: cv2.VideoCapture) -> Image | bytes | None:

@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -184,7 +184,8 @@ class CameraMount:
         return "px" if self.calibration is None and self.pixels_per_mm is None else "mm"
 
     def displacement_mm(self, result: TrackingResult) -> NDArray[np.float64]:
-        """Displacements along the image axes (right, down) [mm], shape (markers, 2).
+        """Displacements (right, down) [mm], shape (markers, 2), along the axes of the image; with a calibration along
+        rows and columns of the grid.
 
         Raises UsageError when the unit is "px".
         """
@@ -254,16 +255,25 @@ def reduce_image(image: Image, reduce: Reduction) -> Image:
 
 def _decoded(data: bytes, flags: int) -> NDArray[np.uint8 | np.uint16]:
     """The decoded image. Raises UnreadableImage when there is none."""
-    try:
-        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags) if data else None
-    except cv2.error:  # a damaged header claims more pixels than OpenCV accepts
-        image = None
-    if image is None or image.dtype not in (np.uint8, np.uint16):
+    image = _decoded_or_none(data, flags)
+    if image is not None and image.dtype in (np.uint8, np.uint16):
+        return image
+    if data.startswith(ENCODED):
+        problem = "cannot be decoded: truncated or damaged"
+    else:
+        if image is None:  # OpenCV does not convert a grey image of floating-point numbers to colours
+            image = _decoded_or_none(data, cv2.IMREAD_UNCHANGED)
+        if image is not None and image.dtype not in (np.uint8, np.uint16):
+            raise UnreadableImage(f"the image has values of type {image.dtype}: convert it to 8 or 16 bits")
         problem = f"do not start like one (first bytes: {data[:8].hex(' ') or 'none'})"
-        if data.startswith(ENCODED):
-            problem = "cannot be decoded: truncated or damaged"
-        raise UnreadableImage(f"expected a JPEG or PNG image, got {len(data)} bytes that {problem}")
-    return np.asarray(image)
+    raise UnreadableImage(f"expected a JPEG or PNG image, got {len(data)} bytes that {problem}")
+
+
+def _decoded_or_none(data: bytes, flags: int) -> NDArray[Any] | None:
+    try:
+        return cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags) if data else None
+    except cv2.error:  # a damaged header claims more pixels than OpenCV accepts
+        return None
 
 
 def tactile_frame(results: Sequence[TrackingResult], mounts: Sequence[CameraMount], stamp: float) -> TactileFrame:

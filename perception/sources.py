@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from gelflow.clock import Clock, ScaledClock
 from gelflow.errors import PeerError, PeerTimeout, UsageError
 from gelflow.perception.capture import Capture
-from gelflow.perception.errors import TrackerInitError
+from gelflow.perception.errors import TrackerInitError, name_for_opencv
 from gelflow.perception.frames import ENCODED, ImageDecoder, UnreadableImage
 from gelflow.perception.sensors.profile import SensorProfile, load_sensor_profile
 from gelflow.session.reader import SessionReader
@@ -78,7 +78,7 @@ class ImageSource:
         """Iterates over the images; those that cannot be decoded are skipped and counted in `skipped`.
 
         Raises PeerError when no image can be read, a video ends early, or the image size changes, UsageError for a TIFF
-        file with several pages.
+        file with several pages or a name that is not UTF-8.
         """
         if self.kind == "session":
             images = self._from_session()
@@ -251,6 +251,8 @@ def _is_image(path: Path) -> bool:
 
 
 def _check_pages(file: Path) -> None:
-    """Raise UsageError for a TIFF file with several pages: OpenCV would read the first page only."""
-    if file.suffix.lower() in (".tif", ".tiff") and (pages := cv2.imcount(str(file))) > 1:
+    """Raise UsageError for a TIFF file with several pages, of which OpenCV would read the first only, and for one whose
+    name is not UTF-8.
+    """
+    if file.suffix.lower() in (".tif", ".tiff") and (pages := cv2.imcount(name_for_opencv(file))) > 1:
         raise UsageError(f"{file} has {pages} pages; split it into a folder of images")

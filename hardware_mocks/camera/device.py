@@ -230,9 +230,13 @@ class MockMjpegCamera:
 
     def _snapshot(self) -> bytes | None:
         """The next image; None at the end."""
+
+        def ended() -> bool:
+            return self._closing or self._failure is not None or self._epoch != epoch
+
         with self._changed:
             before, epoch = self._number, self._epoch
-            self._changed.wait_for(lambda: self._closing or self._epoch != epoch or self._number > before)
+            self._changed.wait_for(lambda: ended() or self._number > before)
             return self._image if self._number > before else None
 
     @contextlib.contextmanager

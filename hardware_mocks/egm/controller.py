@@ -91,6 +91,7 @@ class Controller:
         self._newest = b""  # feedback
         self._blocked: set[int] = set()  # faults that keep the arm from moving
         self._lose, self._loss = 0, 0.0
+        self._silenced: set[int] = set()  # faults that keep the arm from sending and receiving
         self._silent_until = -math.inf
         self._sequence = self._ticks = 0
         self._unanswered = self._settled = self._ended = 0.0
@@ -115,11 +116,13 @@ class Controller:
         self._silent_until = self._clock.now() + seconds
 
     def begin_fault(self, number: int, kind: str, direction: str, values: dict[str, Any]) -> None:
-        """Begin a fault: freeze (feedback repeats), stall (the arm does not move) or one of the messages."""
+        """Begin a fault: freeze (feedback repeats), stall (no motion), disconnect or one of the messages."""
         if kind == "freeze":
             self._frozen[number] = self._newest
         elif kind == "stall":
             self._blocked.add(number)
+        elif kind == "disconnect":
+            self._silenced.add(number)
         else:
             for name, link in self.links.items():
                 if direction in (name, "both"):
@@ -129,12 +132,13 @@ class Controller:
         """End the fault with this number."""
         self._frozen.pop(number, None)
         self._blocked.discard(number)
+        self._silenced.discard(number)
         for link in self.links.values():
             link.end(number)
 
     def receive(self, data: bytes) -> None:
         """Process a datagram: start or continue to follow."""
-        if self._clock.now() < self._silent_until:
+        if self._is_silent():
             return
         report, last = self.report, self._reference
         try:
@@ -189,9 +193,12 @@ class Controller:
         if self._lose > 0:
             self._lose -= 1
             return True
-        lost = self._clock.now() < self._silent_until or self._random.random() < self._loss
+        lost = self._is_silent() or self._random.random() < self._loss
         self.report.sent += not lost
         return lost
+
+    def _is_silent(self) -> bool:
+        return bool(self._silenced) or self._clock.now() < self._silent_until
 
     def _rested(self) -> bool:
         return self._clock.now() - self._ended > self._config.restart_after

@@ -106,7 +106,7 @@ class MockEgmArm:
         self._call("silence", seconds)
 
     def begin_fault(self, number: int, kind: str, direction: str, values: dict[str, Any]) -> None:
-        """Begin a fault of the arm (freeze, stall) or of its messages (`MESSAGE_KINDS`) with its parameters.
+        """Begin a fault of the arm (freeze, stall, disconnect) or of its messages (`MESSAGE_KINDS`), with parameters.
 
         `direction` is "out" (feedback), "in" (references) or "both".
         """

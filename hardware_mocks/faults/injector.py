@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from gelflow.clock import ScaledClock
-from gelflow.errors import GelflowError, PeerError
+from gelflow.errors import GelflowError, PeerError, UsageError
 from gelflow.hardware_mocks.camera.device import MockMjpegCamera
 from gelflow.hardware_mocks.egm.device import MockEgmArm
 from gelflow.hardware_mocks.faults.plan import KINDS, Fault, FaultPlan
@@ -41,7 +41,7 @@ class Devices:
         elif fault.device == "gripper":
             self._begin_gripper(number, fault)
         elif fault.device == "world":
-            self._set_world()
+            self._begin_world(number)
         else:
             for camera in self._chosen(fault.device):
                 camera.begin_fault(number, fault.kind, fault.values)
@@ -52,8 +52,6 @@ class Devices:
         if fault.device == "arm":
             if fault.kind in _STOPS:
                 self._set_stops()
-            elif fault.kind == "disconnect":
-                self.arm.silence(0.0)
             else:
                 self.arm.end_fault(number)
         elif fault.device == "gripper":
@@ -67,8 +65,6 @@ class Devices:
     def _begin_arm(self, number: int, fault: Fault) -> None:
         if fault.kind == "restart":
             self.arm.restart_sequence()
-        elif fault.kind == "disconnect":
-            self.arm.silence(min(fault.duration, 1e9))
         elif fault.kind in _STOPS:
             self._set_stops()
         else:
@@ -87,6 +83,13 @@ class Devices:
         kinds = {fault.kind for fault in self._active.values() if fault.device == "arm"}
         self.arm.motors(not kinds & {"emergency_stop", "motors_off"})
         self.arm.rapid(not kinds & {"emergency_stop", "rapid_stop"})
+
+    def _begin_world(self, number: int) -> None:
+        try:
+            self._set_world()
+        except UsageError:  # a value would leave its limits: the fault does not begin
+            del self._active[number]
+            raise
 
     def _set_world(self) -> None:
         factors = {"stiff_gel": 1.0, "slip": 1.0}

@@ -72,7 +72,7 @@ class Fault:
     seed: int = 0  # of all random numbers of this fault
     after: float = 0.0  # delay of the start after the event
     below: float | None = None  # height of the lower face for the events descent and lowering
-    attempt: int = 1  # the event counts from this attempt on
+    attempt: int = 1  # descent, lowering and attempt count from this attempt on
     duration: float = math.inf
     direction: str = "both"  # of the messages
     parameters: Mapping[str, float] = field(default_factory=dict)
@@ -89,6 +89,10 @@ class Fault:
             _choose("event", self.event, EVENTS)
         if self.below is not None and self.event not in ("descent", "lowering"):
             raise UsageError("below belongs to the events descent and lowering")
+        if self.attempt > 1 and self.event not in ("descent", "lowering", "attempt"):
+            raise UsageError("attempt belongs to the events descent, lowering and attempt")
+        if self.after > 0 and not self.event:
+            raise UsageError("after belongs to events")
         if not (self.duration > 0 and self.after >= 0 and self.attempt >= 1 and (self.at is None or self.at >= 0)):
             raise UsageError("duration must be above 0, at and after at least 0, attempt at least 1")
         _choose("direction", self.direction, DIRECTIONS)

@@ -7,6 +7,7 @@ import mmap
 import os
 import sys
 import threading
+import time
 from collections.abc import Callable
 from types import TracebackType
 from typing import Any, Self
@@ -15,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.clock import ScaledClock
-from gelflow.errors import SimulationError
+from gelflow.errors import GelflowError, SimulationError, UsageError
 from gelflow.hardware_mocks.simulated_cell.cell import SimulatedCell, SimulatedCellConfig
 from gelflow.hardware_mocks.simulated_cell.insertion_progress import InsertionProgress
 from gelflow.helper_process import HelperProcess, Messages, connect_to_parent, memory_file
@@ -81,6 +82,7 @@ class SimulatedCellProcess:
         self._helper: HelperProcess | None = None
         self._lock = threading.Lock()
         self._asking = threading.Lock()
+        self._asked = 0  # number of questions so far
         self._tool = self.config.start_tool()
 
     def start(self) -> Self:
@@ -96,7 +98,7 @@ class SimulatedCellProcess:
         finally:
             os.close(memory)
         try:
-            self._receive(self._helper, _START_LIMIT)
+            self._receive(self._helper, self._asked, _START_LIMIT)
         except SimulationError:
             self._helper.close()
             self._helper = None
@@ -160,7 +162,7 @@ class SimulatedCellProcess:
         return InsertionProgress.from_words(self._running().progress.read()[1].tolist())
 
     def change_world(self, *, gel_stiffness: float, pad_friction: float) -> None:
-        """See `SimulatedCell.change_world`."""
+        """See `SimulatedCell.change_world`. Raises UsageError when a value of the world leaves its limits."""
         self._ask({"ask": "change_world", "gel_stiffness": gel_stiffness, "pad_friction": pad_friction})
 
     def _running(self) -> _Shared:
@@ -172,22 +174,29 @@ class SimulatedCellProcess:
         with self._asking:
             if self._helper is None:
                 raise SimulationError("the simulated cell is not running")
+            self._asked += 1
             try:
-                self._helper.messages.send(question)
+                self._helper.messages.send({**question, "number": self._asked})
             except OSError:
                 raise SimulationError(f"the simulated cell has ended: {self._helper.exit_reason()}") from None
-            return self._receive(self._helper, _ANSWER_LIMIT)
+            return self._receive(self._helper, self._asked, _ANSWER_LIMIT)
 
     @staticmethod
-    def _receive(helper: HelperProcess, limit: float) -> Any:
-        """One message from the process."""
-        try:
-            values = helper.messages.wait(limit)
-        except TimeoutError:
-            raise SimulationError(f"the simulated cell did not answer within {limit:g} s") from None
-        if not values:
-            raise SimulationError(f"the simulated cell has ended: {helper.exit_reason()}")
-        return values[0]
+    def _receive(helper: HelperProcess, number: int, limit: float) -> Any:
+        """The answer to the question with this number; late answers to earlier questions are skipped."""
+        end = time.monotonic() + limit
+        while True:
+            try:
+                answers = helper.messages.wait(max(end - time.monotonic(), 0.0))
+            except TimeoutError:
+                raise SimulationError(f"the simulated cell did not answer within {limit:g} s") from None
+            if not answers:
+                raise SimulationError(f"the simulated cell has ended: {helper.exit_reason()}")
+            for answer in answers:
+                if answer["number"] == number:
+                    if "error" in answer:
+                        raise UsageError(answer["error"])
+                    return answer["value"]
 
 
 _ANSWERS: dict[str, Callable[..., Any]] = {
@@ -207,6 +216,7 @@ class _Service:
         self._steps = 0
         self._gel_every = max(1, round(_GEL_PERIOD / cell.config.step))
         self.ending = threading.Event()
+        self.failure: Exception | None = None
 
     def exchange(self) -> None:
         """After each step: read commands, write measurements."""
@@ -230,12 +240,21 @@ class _Service:
         try:
             while not self._parent.closed:
                 for question in self._parent.wait():
-                    values = {key: value for key, value in question.items() if key != "ask"}
-                    self._parent.send(_ANSWERS[question["ask"]](self._cell, **values))
+                    self._answer(**question)
         except OSError:
             return  # the parent ended during an answer
+        except Exception as error:  # noqa: BLE001 - `main` raises it
+            self.failure = error
         finally:
             self.ending.set()
+
+    def _answer(self, ask: str, number: int, **values: Any) -> None:
+        answer: dict[str, Any] = {"number": number}
+        try:
+            answer["value"] = _ANSWERS[ask](self._cell, **values)
+        except GelflowError as error:
+            answer["error"] = str(error)
+        self._parent.send(answer)
 
 
 def main(arguments: list[str]) -> int:
@@ -246,8 +265,10 @@ def main(arguments: list[str]) -> int:
     service = _Service(cell, parent, _Shared(memory, config.grid))
     threading.Thread(target=service.answer, daemon=True).start()
     service.exchange()
-    parent.send(None)
+    parent.send({"number": 0, "value": None})
     cell.run(service.ending, after_step=service.exchange)
+    if service.failure is not None:
+        raise service.failure
     return 0
 
 

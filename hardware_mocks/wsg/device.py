@@ -41,6 +41,12 @@ class _Link:
             for faults in self._faults.values():
                 faults.end(number)
 
+    def clear(self) -> None:
+        """Drop the bytes on the way in both directions: the connection has ended."""
+        with self._lock:
+            for faults in self._faults.values():
+                faults.clear()
+
     def receive(self, data: bytes, now: float) -> None:
         with self._lock:
             self._faults["in"].put(data, now)
@@ -288,4 +294,5 @@ class MockWsgGripper:
         self._selector.unregister(self._client)
         self._client.close()
         self._client_session.lost()
+        self._network.clear()
         self._client = self._client_session = None

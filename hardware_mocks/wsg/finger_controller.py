@@ -49,6 +49,7 @@ class FingerController:
         self._plant = plant
         self._config = config
         self._motion: _Motion | None = None
+        self._clamped = False  # a part is between the fingers, also after a stop has ended the grasping control
         self._held_width = 0.0
         self._held_sign = -1
         self._loose_since: float | None = None
@@ -101,7 +102,7 @@ class FingerController:
         """Stop the fingers; returns the command that ends, with its status."""
         ended = (self._motion.command, Status.CMD_ABORTED) if self._motion is not None else None
         # A held part stays clamped: the drive holds its position, and only the grasping control ends.
-        if self.grasp != GraspState.HOLDING:
+        if not self._clamped:
             self._plant.command_gripper(
                 width=self.measured[0], speed=self._config.speed[0], force=self._config.force[0]
             )
@@ -125,7 +126,7 @@ class FingerController:
             self.grasp = GraspState.IDLE
 
     def lose_part(self) -> None:
-        """Inject a fault: the held part is lost."""
+        """Report that the held part is lost."""
         if self.grasp == GraspState.HOLDING:
             self.grasp = GraspState.PART_LOST
 
@@ -175,6 +176,7 @@ class FingerController:
         self, command: Command, goal: float, speed: float, force: float, now: float, *, nominal: float = 0.0
     ) -> None:
         self._plant.command_gripper(width=goal, speed=speed, force=force)
+        self._clamped = False
         self._motion = _Motion(command, goal, 1 if goal > self.measured[0] else -1, nominal, now)
         self._blocked = self._at_limit = 0
         self._reached = self._stopped = self._failed = False
@@ -208,7 +210,7 @@ class FingerController:
             before_band = motion.sign * (motion.nominal - width) > self._config.clamp_travel
             if before_band:
                 return self._block(motion)
-            self.grasp = GraspState.HOLDING
+            self.grasp, self._clamped = GraspState.HOLDING, True
             self._held_width, self._held_sign, self._loose_since = width, motion.sign, None
             return Status.SUCCESS
         if there:
@@ -223,8 +225,8 @@ class FingerController:
         return Status.AXIS_BLOCKED
 
     def _monitor(self, now: float) -> None:
-        """Detect the loss of a held part."""
-        if self.grasp != GraspState.HOLDING:
+        """Detect the loss of a clamped part; only the grasping control reports it."""
+        if not self._clamped:
             return
         width, _, force = self.measured
         if force >= _LOOSE_FORCE * self.force_limit:
@@ -233,4 +235,5 @@ class FingerController:
             self._loose_since = now
         loose = self._loose_since is not None and now - self._loose_since >= _LOOSE_TIME
         if loose or self._held_sign * (width - self._held_width) > _SLIPPED:
-            self.grasp = GraspState.PART_LOST
+            self._clamped = False
+            self.lose_part()

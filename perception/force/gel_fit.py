@@ -169,6 +169,8 @@ def fit_gel(samples: ForceSamples, gel: ElasticGel) -> GelFit:
     """
     if gel.creep:
         raise UsageError("the gel of the estimates has a creep: track with a gel file without it, then fit again")
+    if not (samples.normal > 0).any():
+        raise UsageError("the estimated normal force of every image with contact is 0: press harder")
     creep, creep_time, creep_deviation = _lag(samples)
     normal = _factor(samples, samples.normal, _lagging(samples, samples.measured_normal, creep, creep_time), "normal")
     shear = _factor(samples, samples.shear, _lagging(samples, samples.measured_shear, creep, creep_time), "shear")
@@ -302,6 +304,9 @@ def _measurements(table: list[dict[str, str]], name: str, path: Path, *, in_time
         if (np.diff(stamps) <= 0).any():
             raise UsageError(f"{path}: stamps must increase")
         return _Measurements(stamps, values, {})
+    for number, row in enumerate(table, start=1):
+        if row.get(name) and not row["image"]:
+            raise UsageError(f"{path}: row {number} has no image; name the image of its {name}")
     names = [row["image"] for row in rows]
     if twice := {image for image in names if names.count(image) > 1}:
         raise UsageError(f"{path}: {name} of {min(twice)} is there twice; keep one of them")

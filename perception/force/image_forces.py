@@ -39,13 +39,11 @@ class ImageForces:
     """Forces and slip from tracked images of one camera."""
 
     def __init__(self, gel: ElasticGel, rows: int, cols: int, scale: GridScale, angle: float = 0.0) -> None:
-        """`angle` is the `grid_angle`; 0 where displacements are along rows and columns, as those of a calibration are.
-
-        Raises UsageError for a grid without forces, see `ForceEstimator`.
-        """
+        """`angle` is the `grid_angle`. Raises UsageError for a grid without forces, see `ForceEstimator`."""
         noise = _NOISE_PX / scale.pixels_per_mm * 1e-3
         grid = Grid(rows, cols, scale.pitch_mm)
         self.angle = angle
+        self._modulus_deviation = gel.youngs_modulus_deviation
         self._estimator = ForceEstimator(gel, grid, noise=noise)
         self._slip = SlipEstimator(grid, friction=gel.friction or None, friction_deviation=gel.friction_deviation)
         self.slip: SlipEstimate | None = None  # in the last image; None where the forces are not known
@@ -61,12 +59,13 @@ class ImageForces:
     ) -> ForceEstimate | None:
         """Forces (right, down) at `stamp` [s] for displacements (right, down) [mm], shape (markers, 2).
 
-        None if fewer than half of the markers are valid.
+        Both are in the axes of the image: rotate displacements of a calibration, which are along rows and columns, by
+        `angle` first. None if fewer than half of the markers are valid.
         """
         displacement = rotated(displacement_mm, -self.angle)[:, ::-1] * 1e-3
         estimate = self._estimator.estimate(displacement, valid, stamp)
         self.slip = self._slip.estimate(estimate, displacement, valid, stamp)
-        return None if estimate is None else _in_image(estimate, self.angle)
+        return None if estimate is None else _in_image(estimate, self.angle, self._modulus_deviation)
 
 
 def force_record(estimate: ForceEstimate, slip: SlipEstimate | None = None) -> dict[str, Any]:
@@ -100,16 +99,21 @@ def slip_record(slip: SlipEstimate) -> dict[str, Any]:
     }
 
 
-def _in_image(estimate: ForceEstimate, angle: float) -> ForceEstimate:
-    """`estimate` along columns and rows, in the axes (right, down) of an image in which the grid is rotated."""
-    centre = estimate.centre_of_pressure
-    # The deviations along rows and columns are taken as independent.
+def _in_image(estimate: ForceEstimate, angle: float, modulus_deviation: float) -> ForceEstimate:
+    """`estimate` along columns and rows, in the axes (right, down) of an image in which the grid is rotated.
+
+    `modulus_deviation` is the relative standard deviation of Young's modulus that the estimate contains.
+    """
+    centre, shear = estimate.centre_of_pressure, rotated(estimate.shear[::-1], angle)
+    # The error of the modulus is one factor of the shear; the other errors along rows and columns are taken as
+    # independent.
+    other = np.maximum(estimate.shear_deviation**2 - (modulus_deviation * estimate.shear) ** 2, 0.0)[::-1]
     shares = np.array([[math.cos(angle), math.sin(angle)], [math.sin(angle), math.cos(angle)]]) ** 2
     return replace(
         estimate,
-        shear=rotated(estimate.shear[::-1], angle),
+        shear=shear,
         moment=-estimate.moment,
         centre_of_pressure=None if centre is None else rotated(centre[::-1], angle),
-        shear_deviation=np.sqrt(shares @ estimate.shear_deviation[::-1] ** 2),
+        shear_deviation=np.sqrt(shares @ other + (modulus_deviation * shear) ** 2),
         shear_field=rotated(estimate.shear_field[:, ::-1], angle),
     )

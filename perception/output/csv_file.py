@@ -10,7 +10,7 @@ from gelflow.errors import PeerError, UsageError
 
 
 class CsvFile:
-    """A new CSV file with a header.
+    """A new CSV file with a header, in UTF-8; characters of file names that are not UTF-8 become escape sequences.
 
     Raises UsageError when the file cannot be created, and PeerError when it cannot be written, as on a full disk.
     """
@@ -18,7 +18,7 @@ class CsvFile:
     def __init__(self, path: Path, columns: Sequence[str]) -> None:
         self._path = path
         try:
-            self._file = path.open("x", encoding="utf-8", newline="")
+            self._file = path.open("x", encoding="utf-8", errors="backslashreplace", newline="")
         except OSError as error:
             raise UsageError(f"cannot create {path}: {error.strerror}") from None
         self._writer = csv.writer(self._file)

@@ -78,7 +78,10 @@ def force_text(force: ForceEstimate | None) -> str:
         return "force unknown: too few markers measured"
     if not force.contact:
         return f"no contact: normal below {3 * force.normal_deviation:.2f} N"
-    shear, deviation = np.linalg.norm(force.shear), np.linalg.norm(force.shear_deviation) / np.sqrt(2)
+    shear = float(np.linalg.norm(force.shear))
+    # Along the shear: exact for the error of the modulus, which is common to both axes, otherwise an upper bound.
+    direction = np.abs(force.shear) / shear if shear else np.full(2, 0.5)
+    deviation = float(direction @ force.shear_deviation)
     return (
         f"normal {force.normal:.2f} +- {force.normal_deviation:.2f} N, shear {shear:.2f} +- {deviation:.2f} N, "
         f"moment {1e3 * force.moment:.1f} +- {1e3 * force.moment_deviation:.1f} N mm"

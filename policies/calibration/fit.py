@@ -8,7 +8,7 @@ of the hole, so that starts can end in different minima; their spread is part of
 """
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import as_completed
+from concurrent.futures import BrokenExecutor, as_completed
 from dataclasses import dataclass
 
 import numpy as np
@@ -143,11 +143,17 @@ def fit(
             results.append(_fit_start(*job))
             progress(len(results))
     else:
-        with worker_pool(min(processes, len(jobs))) as pool:
-            futures = [pool.submit(_fit_start, *job) for job in jobs]
-            for done, _ in enumerate(as_completed(futures)):
-                progress(done + 1)
-            results = [future.result() for future in futures]
+        try:
+            with worker_pool(min(processes, len(jobs))) as pool:
+                futures = [pool.submit(_fit_start, *job) for job in jobs]
+                for done, _ in enumerate(as_completed(futures)):
+                    progress(done + 1)
+                results = [future.result() for future in futures]
+        except BrokenExecutor as error:
+            raise SimulationError(
+                "a process of the fit was killed, as the system does when memory is short; close other programs, or "
+                "calibrate fewer sessions at a time"
+            ) from error
     ended = sorted((result for result in results if result is not None), key=lambda result: result.cost)
     if not ended:
         raise SimulationError("the recorded descents cannot be simulated with any start of the fit")

@@ -42,6 +42,11 @@ class Problem:
     def __init__(self, recordings: Recordings, *, threads: int | None = None, rough: bool = False) -> None:
         if not len(recordings):
             raise UsageError("the recordings have no attempt with contact: there is nothing to fit")
+        if not recordings.used.reshape(2, -1).any(1).all():
+            raise UsageError(
+                "no marker of a pad can be compared: its camera shows too few lines of the printed grid, or all of its "
+                "markers are too noisy"
+            )
         self.readings = ReadingModel(recordings, threads=threads, rough=rough)
         self.fitted = self.readings.fitted
         self._scale = self.readings.scale

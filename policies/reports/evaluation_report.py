@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
+from gelflow.policies.checkpoint import replace_file
 from gelflow.policies.episodes import Episodes, Film, OraclePolicy, RandomPolicy, record_films, run_episodes
 from gelflow.policies.evaluation import EvaluationResult
 from gelflow.policies.networks.base import BatchPolicy, Network
@@ -91,8 +92,9 @@ def evaluate_all(
     if out is None:
         return report
     try:
+        _write_results(out, report)
         _remove_files(out)
-        report.files += _write_tables(out, own, report)
+        _write_tables(out, own, report)
         started("films of a success and a failure")
         report.files += _write_films(out, own, network, task, seed=seed)
     except (OSError, UsageError) as error:
@@ -143,13 +145,23 @@ def _check_replaceable(out: Path) -> None:
         raise UsageError(f"{out / present[0]} would be replaced, and is not of an evaluation: choose another folder")
 
 
+def _write_results(out: Path, report: Report) -> None:
+    """Replaces the results as a whole, before all other files: on a full disk those of an earlier report remain."""
+    rows = [entry.to_json() for entry in report.failures]
+    values = {"format": FORMAT, "results": [result.to_json() for result in report.results], "failures": rows}
+    replace_file(out / RESULTS, (json.dumps(to_plain(values), indent=2) + "\n").encode())
+    report.files.append(out / RESULTS)
+
+
 def _remove_files(out: Path) -> None:
-    """Removes the files of an earlier report; the new one need not have a failure, or a success."""
+    """Removes the other files of an earlier report; the new one need not have a failure, or a success."""
     for name in _FILES:
-        (out / name).unlink(missing_ok=True)
+        if name != RESULTS:
+            (out / name).unlink(missing_ok=True)
 
 
-def _write_tables(out: Path, episodes: Episodes, report: Report) -> list[Path]:
+def _write_tables(out: Path, episodes: Episodes, report: Report) -> None:
+    """Writes the episodes, and the failures, if there are any, as a table and as a picture."""
     with (out / EPISODES).open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         names = [_with_unit(name, episodes.quantity_units[name]) for name in episodes.quantities]
@@ -157,17 +169,17 @@ def _write_tables(out: Path, episodes: Episodes, report: Report) -> list[Path]:
         results = (episodes.success, episodes.failed, episodes.length, episodes.reward, *episodes.metrics.values())
         columns = (*results, *episodes.quantities.values())
         writer.writerows(zip(*(column.tolist() for column in columns), strict=True))
+    report.files.append(out / EPISODES)
     rows = [entry.to_json() for entry in report.failures]
-    values = {"format": FORMAT, "results": [result.to_json() for result in report.results], "failures": rows}
-    (out / RESULTS).write_text(json.dumps(to_plain(values), indent=2) + "\n", "utf-8")
     if not rows:
-        return [out / RESULTS, out / EPISODES]
+        return
     with (out / FAILURES).open("w", newline="", encoding="utf-8") as file:
         table = csv.DictWriter(file, list(rows[0]))
         table.writeheader()
         table.writerows(rows)
+    report.files.append(out / FAILURES)
     draw_failures(out / FAILURE_PICTURE, report.failures)
-    return [out / name for name in (RESULTS, EPISODES, FAILURES, FAILURE_PICTURE)]
+    report.files.append(out / FAILURE_PICTURE)
 
 
 def _with_unit(name: str, unit: str) -> str:

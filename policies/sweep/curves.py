@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.figures import SERIES, save
-from gelflow.policies.sweep.results import Row, group
+from gelflow.policies.sweep.results import Row, group, option_columns
 from gelflow.policies.sweep.run import Run, RunRecord
 from gelflow.toml_tables import suggestion
 
@@ -46,8 +46,9 @@ class Curves:
     def rows(self) -> list[Row]:
         """One flat table row per point."""
         return [
-            {**c.values, self.x_name: x, "median": median, "smallest": low, "largest": high, "seeds": c.seeds}
+            {**options, self.x_name: x, "median": median, "smallest": low, "largest": high, "seeds": c.seeds}
             for c in self.curves
+            for options in [option_columns(c.values)]
             for x, median, low, high in zip(
                 c.x.tolist(), c.median.tolist(), c.low.tolist(), c.high.tolist(), strict=True
             )

@@ -13,6 +13,14 @@ from gelflow.policies.sweep.run import Run, RunRecord
 
 Row = dict[str, Any]
 
+# Names of the other columns of the tables: of a run, a configuration and a learning curve, and results of a training.
+_OTHER_COLUMNS = {
+    *("name", "seed", "state", "starts", "seconds", "machine", "error"),
+    *("runs", "complete"),
+    *("median", "smallest", "largest", "seeds"),
+    *("steps", "minutes"),
+}
+
 
 @dataclass(frozen=True)
 class Range:
@@ -38,13 +46,19 @@ class Configuration:
     results: dict[str, Range]  # of the numbers that every complete run printed, by dotted key
 
 
+def option_columns(values: Mapping[str, Any]) -> Row:
+    """Options as columns of a table; one with the name of another column is named such as `option.steps`."""
+    return {f"option.{name}" if name in _OTHER_COLUMNS else name: value for name, value in values.items()}
+
+
 def rows(runs: Sequence[Run], records: Mapping[str, RunRecord]) -> list[Row]:
     """One flat table row per run: options, seed, state, and what the command printed under dotted keys."""
     found = []
     for run in runs:
         record = records[run.name]
         state = {key: getattr(record, key) for key in ("state", "starts", "seconds", "machine", "error")}
-        found.append({"name": run.name, **run.values, "seed": run.seed, **state, **flatten(record.result)})
+        options = option_columns(run.values)
+        found.append({"name": run.name, **options, "seed": run.seed, **state, **flatten(record.result)})
     return found
 
 
@@ -93,7 +107,7 @@ def summary_rows(found: Sequence[Configuration]) -> list[Row]:
     """One flat table row per configuration."""
     return [
         {
-            **configuration.values,
+            **option_columns(configuration.values),
             "runs": configuration.runs,
             "complete": configuration.complete,
             **{

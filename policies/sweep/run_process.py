@@ -136,7 +136,8 @@ class RunProcess:
         record = dataclasses.replace(
             read_record(self._run), seconds=time.monotonic() - self._started, exit_code=code, machine=self._machine
         )
-        if code in _WITH_RESULT and result is not None:
+        # The object is printed last: a process with a complete one that a signal ended had finished its work.
+        if (code < 0 or code in _WITH_RESULT) and result is not None:
             return self._complete(record, result)
         record = dataclasses.replace(record, state="failed", error=_reason(code, self._run.log))
         write_record(self._run, record)

@@ -67,6 +67,7 @@ class TrainingResult:
     minutes: float
     seconds: dict[str, float]  # of the time: "simulation", "learning", "evaluation"
     checkpoint: Path  # the best policy on the validation episodes
+    stored: bool = False  # of an earlier command, read from the folder
 
     @property
     def shares(self) -> dict[str, float]:
@@ -134,11 +135,14 @@ class TrainingRun:
     def train(self) -> TrainingResult:
         """Trains until the steps or the minutes are used up, resuming an unfinished run of the same configuration.
 
-        Raises UsageError when the folder cannot be written, is in use, holds a finished run, or a run of another
-        configuration.
+        The result of a finished run of the same configuration is read from the folder: a command whose output was lost
+        can be repeated. Raises UsageError when the folder cannot be written, is in use, or holds a run of another
+        configuration or a policy of another origin.
         """
         torch.set_num_threads(1)  # small matrices; one thread makes a run repeatable
         with locked(self.folder):
+            if self.is_finished() and (result := self._stored_result()) is not None:
+                return result
             self._prepare()
             start = time.monotonic()
             log = ProgressLog(self.folder, (*self.learner.columns,), self.learner.steps)
@@ -242,10 +246,14 @@ class TrainingRun:
         }
         save_state(self.folder / STATE, state)
 
-    def _write_configuration(self, configuration: Mapping[str, Any], *, finished: bool) -> None:
+    def _write_configuration(
+        self, configuration: Mapping[str, Any], *, finished: bool, result: Mapping[str, Any] | None = None
+    ) -> None:
         versions = {"gelflow": __version__, "python": platform.python_version()}
         versions |= {"numpy": np.__version__, "torch": str(torch.__version__)}
         values = {"format": FORMAT, "finished": finished, "command": list(self.command), "versions": versions}
+        if result is not None:
+            values["result"] = result
         text = readable_json({**values, "configuration": configuration})
         replace_file(self.folder / CONFIGURATION, text.encode())
 
@@ -253,10 +261,22 @@ class TrainingRun:
         """Draws the learning curve and marks the run as finished."""
         assert self._best is not None
         progress_curve.draw(self.folder / PICTURE, self.folder / PROGRESS, title=self.learner.task.description.name)
-        self._write_configuration(self._configuration(), finished=True)
+        numbers: dict[str, Any] = {"steps": self.learner.steps, "minutes": self._minutes(start)}
+        numbers["seconds"] = dict(self.learner.clock.seconds)
+        self._write_configuration(self._configuration(), finished=True, result={"best": vars(self._best), **numbers})
         (self.folder / STATE).unlink(missing_ok=True)
-        seconds, minutes = dict(self.learner.clock.seconds), self._minutes(start)
-        return TrainingResult(self.folder, self._best, self.learner.steps, minutes, seconds, self.checkpoint)
+        return TrainingResult(self.folder, self._best, checkpoint=self.checkpoint, **numbers)
+
+    def _stored_result(self) -> TrainingResult | None:
+        """The result in the folder of a finished run; None without its policy, or of an earlier version."""
+        stored = read_configuration(self.folder).get("result")
+        if stored is None or not self.checkpoint.exists():
+            return None
+        values = dict(stored)
+        best = dict(values.pop("best"))
+        best["metrics"] = {name: float(value) for name, value in best["metrics"].items()}  # not a number: text
+        evaluation = EvaluationResult(**best | {name: float(best[name]) for name in ("length", "reward")})
+        return TrainingResult(self.folder, evaluation, checkpoint=self.checkpoint, stored=True, **values)
 
 
 @contextlib.contextmanager

@@ -85,7 +85,9 @@ class Messages:
         return values
 
     def close(self) -> None:
-        """Close this end."""
+        """Close this end; a thread that waits for a message stops waiting."""
+        with contextlib.suppress(OSError):
+            self._link.shutdown(socket.SHUT_RDWR)  # `close` alone does not end a `select` of another thread
         self._link.close()
 
 

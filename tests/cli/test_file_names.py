@@ -39,6 +39,14 @@ def test_names_that_opencv_cannot_use_are_refused(
     assert "is not valid UTF-8: rename the file" in error and error.count("\n") == 1
 
 
+def test_tables_escape_such_names_of_images(images: Path, tmp_path: Path) -> None:
+    for number, file in enumerate(sorted(images.iterdir())):
+        (tmp_path / f"{NAME}{number}{file.suffix}").write_bytes(file.read_bytes())
+    table = tmp_path / "table.csv"
+    assert main(["track", str(tmp_path), "--out", str(table)]) == 0
+    assert "k\\udce40" in table.read_text(encoding="utf-8")
+
+
 def test_pictures_may_have_such_names(images: Path, tmp_path: Path) -> None:
     drawn, tracked = tmp_path / f"{NAME}.png", tmp_path / f"{NAME}.jpg"
     assert main(["render-scene", "pushing", "--size", "160x120", "--out", str(drawn)]) == 0

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -9,7 +10,11 @@ import pytest
 from gelflow.cli.main import main
 from gelflow.cli.promises.outcome import Outcome, Promise, Row
 from gelflow.errors import UsageError
+from gelflow.policies.calibration.planning.motions import Plan
+from gelflow.policies.calibration.session_recordings import nothing_recorded
+from gelflow.session.motion_plan import PlannedMotion
 from gelflow.sim.benchmark.tradeoff.sweep import Tradeoff
+from gelflow.task import INSERTION
 
 TRADEOFF = ["tradeoff", "pushing", "--json", "--out"]
 BENCH = ["bench", "scenes", "--quick", "--json", "--out"]
@@ -80,6 +85,38 @@ def test_the_result_is_printed_before_its_file_is_written(
     printed = capsys.readouterr()
     assert key in json.loads(printed.out) and file in printed.err
     assert len(measured) == 1
+
+
+@pytest.mark.parametrize("target", ["_write_new", "plan_motions", "save_motion_plan"])
+def test_a_fit_is_printed_where_the_report_or_the_plan_fails(
+    target: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recordings = nothing_recorded(INSERTION, grasp_force=None, grasp_height=None)
+    plan = Plan((PlannedMotion(3e-3, 0.0, 0.0, 1e-3),), (1.5,), {})
+    replaced: dict[str, Any] = {
+        **{"read_attempts": recordings, "plan_motions": plan, "plain_report": {"attempts": {}}, "page": ""},
+        **{"calibrate": SimpleNamespace(fit=None, recordings=recordings), "write_scene": [], target: None},
+    }
+
+    def replace(name: str) -> Any:
+        def function(*arguments: Any, **options: Any) -> Any:
+            if name == target:
+                raise UsageError("No space left on device")
+            return replaced[name]
+
+        return function
+
+    for name in replaced:
+        monkeypatch.setattr(f"gelflow.cli.commands.calibrate.{name}", replace(name))
+    files = ["--out", str(tmp_path / "out"), "--plan", str(tmp_path / "plan.toml")]
+    assert main(["calibrate", "a.mcap", *files, "--json"]) == 2
+    printed = capsys.readouterr()
+    values = json.loads(printed.out)
+    assert values["attempts"] == {} and "No space left on device" in printed.err
+    assert [motion["gain"] for motion in values.get("plan", [])] == ([1.5] if target == "save_motion_plan" else [])
+    if target == "save_motion_plan":
+        assert main(["calibrate", *files[2:], "--json"]) == 2  # without a session
+        assert json.loads(capsys.readouterr().out)["plan"] == values["plan"]
 
 
 @pytest.mark.parametrize("command", [TRADEOFF, BENCH, PROMISES, EGM])

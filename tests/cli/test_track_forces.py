@@ -71,17 +71,25 @@ def test_forces_are_written_everywhere(
     assert cv2.imread(str(files[2])) is not None
 
 
+@pytest.mark.parametrize("calibrated", [False, True])
 def test_a_grid_that_is_rotated_in_the_image_has_the_same_forces(
-    images: Path, pressed: PressedGel, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    calibrated: bool, images: Path, pressed: PressedGel, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     renderer = AccurateGelRenderer(replace(LOOK, width=880, height=760))
+    folder = tmp_path / "turned"
+    folder.mkdir()
     turn = cv2.getRotationMatrix2D((439.5, 379.5), -15.0, 1.0)  # clockwise
     for number, share in enumerate((0.0, 0.5, 1.0)):
         picture = renderer.render(share * pressed.displacement_mm, number=number).image
         turned = cv2.warpAffine(picture, turn, (880, 760), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-        cv2.imwrite(str(tmp_path / f"{number}.png"), turned)
-    scale = ["--pixels-per-mm", str(LOOK.pixels_per_mm), "--gel", str(images / "gel.toml")]
-    assert main(["track", str(tmp_path), *scale, "--json"]) == 0
+        cv2.imwrite(str(folder / f"{number}.png"), turned)
+    scale = ["--pixels-per-mm", str(LOOK.pixels_per_mm)]
+    if calibrated:
+        scale = ["--calibration", str(tmp_path / "fit.json")]
+        spacing = ["--spacing-mm", str(LOOK.grid.pitch), "--out", scale[1]]
+        assert main(["calibrate-camera", str(folder / "0.png"), *spacing]) == 0
+        capsys.readouterr()
+    assert main(["track", str(folder), *scale, "--gel", str(images / "gel.toml"), "--json"]) == 0
     force = json.loads(capsys.readouterr().out)["force"]
     assert force["normal"] == pytest.approx(pressed.normal, rel=0.1)
     assert abs(force["moment"]) < 8e-5  # [N m]; in the axes of the image it would be 1.8e-4

@@ -1,6 +1,7 @@
 """Helper processes: the link to the parent, and how a failed helper is reported."""
 
 import json
+import os
 import signal
 import socket
 import subprocess
@@ -60,6 +61,16 @@ def test_waiting_for_a_value() -> None:
     assert messages.wait(5.0) == [1, 2]
     other.close()
     assert messages.wait(5.0) == [] and messages.closed
+
+
+def test_closing_reaches_the_peer_while_a_thread_waits() -> None:
+    messages, other = pair()
+    waiting = os.dup(messages.fileno())  # as `select` in another thread, which keeps the socket open
+    messages.close()
+    other.settimeout(20)
+    assert other.recv(1) == b""
+    os.close(waiting)
+    other.close()
 
 
 def test_exit_reason_of_a_helper_that_fails() -> None:

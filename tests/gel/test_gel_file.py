@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from gelflow.errors import UsageError
-from gelflow.gel.gel_file import ElasticGel, load_gel
+from gelflow.gel.gel_file import ElasticGel, load_gel, save_gel
 
 TEXT = """
 format = 1
@@ -19,6 +19,12 @@ thickness = 0.003
 def test_a_file_is_read(tmp_path: Path) -> None:
     (tmp_path / "gel.toml").write_text(TEXT + "youngs_modulus_deviation = 0.1\n")
     assert load_gel(tmp_path / "gel.toml") == ElasticGel(1.5e5, 0.48, 0.003, 0.1)
+
+
+def test_a_file_name_may_be_text(tmp_path: Path) -> None:
+    gel, name = ElasticGel(1.5e5, 0.48, 0.003), str(tmp_path / "new.toml")
+    save_gel(gel, name)
+    assert load_gel(name) == gel
 
 
 @pytest.mark.parametrize(

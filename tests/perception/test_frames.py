@@ -126,6 +126,13 @@ def test_images_of_16_bits_are_reduced_by_the_bits_that_the_first_one_uses(bits:
         assert decoder(bytes(cv2.imencode(suffix, np.full((48, 64), 60000, np.uint16))[1])).min() == 255
 
 
+@pytest.mark.parametrize("shape", [(48, 64), (48, 64, 3)])
+def test_an_image_of_another_number_type_names_its_type(shape: tuple[int, ...]) -> None:
+    data = bytes(cv2.imencode(".tiff", np.ones(shape, np.float32))[1])
+    with pytest.raises(PeerError, match="values of type float32: convert it to 8 or 16 bits"):
+        decode_image(data)
+
+
 def test_decoding_is_repeatable() -> None:
     renderer = FastGelRenderer()
     data = renderer.encode(renderer.render(np.zeros((252, 2))))

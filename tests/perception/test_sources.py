@@ -1,5 +1,6 @@
 """Image sources with damaged content: folders, videos, sessions, and a stream whose image size changes."""
 
+import os
 import re
 import threading
 from collections.abc import Iterator
@@ -86,6 +87,14 @@ def test_a_tiff_file_with_several_pages_is_an_error(tmp_path: Path) -> None:
         assert [next(images).name for _ in range(read)] == ["0.tif"][:read]
         with pytest.raises(UsageError, match=r"1\.tiff has 3 pages; split it into a folder of images"):
             next(images)
+
+
+def test_a_tiff_file_whose_name_is_not_utf_8_is_an_error(tmp_path: Path) -> None:
+    # OpenCV would end the process.
+    file = tmp_path / os.fsdecode(b"k\xe4.tif")
+    file.write_bytes(bytes(cv2.imencode(".tif", picture(0))[1]))
+    with pytest.raises(UsageError, match="is not valid UTF-8: rename the file"):
+        names(image_source(str(file)))
 
 
 def start(image: np.ndarray) -> int:
@@ -261,12 +270,15 @@ def test_images_of_a_video_with_an_uneven_rate_have_their_own_times(tmp_path: Pa
     # A block is the number of its track, its time [ms] in two bytes, flags, and the JPEG image.
     head, *blocks = re.split(rb"(?=\x81...\xff\xd8)", path.read_bytes(), flags=re.DOTALL)
     assert len(blocks) == 10
-    for k in range(5, 10):
-        late = int.from_bytes(blocks[k][1:3], "big") + 100
-        blocks[k] = blocks[k][:1] + late.to_bytes(2, "big") + blocks[k][3:]
-    path.write_bytes(head + b"".join(blocks))
-    uneven = [image.stamp for image in image_source(str(path))]
-    np.testing.assert_allclose(uneven, np.arange(10) / 25 + 0.1 * (np.arange(10) >= 5), atol=2e-3)
+    for times in (
+        [0, 40, 80, 120, 160, 300, 340, 380, 420, 460],
+        [0, 40, 80, 300, 300, 340, 380, 380, 420, 460],  # two bursts, each within one millisecond
+    ):
+        timed = [block[:1] + time.to_bytes(2, "big") + block[3:] for time, block in zip(times, blocks, strict=True)]
+        path.write_bytes(head + b"".join(timed))
+        uneven = [image.stamp for image in image_source(str(path))]
+        np.testing.assert_allclose(uneven, np.array(times) / 1e3, atol=2e-3)
+        assert (np.diff(uneven) > 0).all()
 
 
 @pytest.mark.parametrize("kept", [0, 300])  # without its first bytes it cannot be recognized as a JPEG image

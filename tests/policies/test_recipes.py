@@ -120,8 +120,9 @@ def test_a_task_is_trained_and_evaluated_by_commands(tmp_path: Path, capsys: pyt
     assert main(["train", "cap", *options]) == 0
     made = json.loads(capsys.readouterr().out)
     assert made["steps"] >= 8 and set(made["shares"]) == {"simulation", "learning", "evaluation"}
-    assert main(["train", "cap", *options]) == 2
-    assert "already holds a trained policy" in capsys.readouterr().err
+    assert main(["train", "cap", *options]) == 0
+    again = capsys.readouterr()
+    assert json.loads(again.out) == made and "holds this training already" in again.err
     arguments = ["--checkpoint", made["checkpoint"], "--episodes", "2", "--envs", "2", "--json"]
     assert main(["eval", "cap", *arguments]) == 0
     printed = json.loads(capsys.readouterr().out)
@@ -208,6 +209,30 @@ def test_an_evaluation_replaces_only_files_of_an_evaluation(tmp_path: Path, monk
     monkeypatch.setattr("gelflow.policies.reports.evaluation_report._write_tables", full)
     report = evaluate_all(network, task, episodes=4, seed=1, out=tmp_path)
     assert len(report.results) == 2 and isinstance(report.error, OSError)
+
+
+@pytest.mark.parametrize("target", ["os.fsync", "gelflow.policies.reports.evaluation_report._write_tables"])
+def test_a_full_disk_leaves_the_results_of_an_evaluation(
+    target: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    task = PointTask(4)
+    architecture = MLP(observation_shape=(4,), actions=2, hidden=(8,))
+    network = architecture.network(task.description, TorchActor(architecture).tensors())
+    assert evaluate_all(network, task, episodes=4, seed=1, out=tmp_path).error is None
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+
+    def full(*arguments: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(target, full)
+        report = evaluate_all(network, task, episodes=4, seed=2, out=tmp_path)
+    assert isinstance(report.error, OSError)
+    if target == "os.fsync":
+        assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+    else:
+        assert [path.name for path in tmp_path.iterdir()] == ["results.json"] == [p.name for p in report.files]
+    assert evaluate_all(network, task, episodes=4, seed=2, out=tmp_path).error is None
 
 
 def test_films_show_the_evaluated_episodes() -> None:

@@ -1,5 +1,6 @@
 """Training runs: one folder, resumed after a kill at any moment, on analytic tasks."""
 
+import dataclasses
 import errno
 import json
 import sys
@@ -152,7 +153,7 @@ def test_a_full_disk_does_not_empty_the_table_of_a_resumed_run(tmp_path: Path, m
 
 def test_a_folder_belongs_to_one_run(tmp_path: Path) -> None:
     make_run(tmp_path / "done", settings=RunSettings(steps=256, evaluate_episodes=4)).train()
-    with pytest.raises(UsageError, match="already holds a trained policy"):
+    with pytest.raises(UsageError, match=r"holds a finished run with other settings: run.steps 256 \(here 2048\)"):
         make_run(tmp_path / "done").train()
     with pytest.raises(Killed):
         make_run(tmp_path / "other", report=killed_after(600)).train()
@@ -165,6 +166,25 @@ def test_a_folder_belongs_to_one_run(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(UsageError, match="cannot write into"):
         make_run(tmp_path / "file").train()
+
+
+def test_a_repeated_finished_run_returns_its_stored_result(tmp_path: Path) -> None:
+    def run() -> TrainingRun:
+        return make_run(tmp_path, settings=RunSettings(steps=256, evaluate_episodes=4))
+
+    first = run().train()
+    files = {path: path.stat().st_mtime_ns for path in tmp_path.iterdir() if path.name != "lock"}
+    again = run().train()
+    assert again.stored and not first.stored
+    assert repr(dataclasses.replace(again, stored=False)) == repr(first)  # the mean length may be nan
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.iterdir() if path.name != "lock"} == files
+    values = json.loads((tmp_path / "run.json").read_text())
+    del values["result"]  # as an earlier version wrote it
+    (tmp_path / "run.json").write_text(json.dumps(values))
+    with pytest.raises(UsageError, match="already holds a trained policy"):
+        run().train()
+    (tmp_path / "run.json").write_text(json.dumps({**values, "finished": False}))
+    assert not run().train().stored
 
 
 def test_a_damaged_state_gives_a_message_of_one_line(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from gelflow.session.channels import JSON, PROTOBUF
 
-LAYOUT = json.loads((Path(__file__).resolve().parents[2] / "docs/guide/look/foxglove_layout.json").read_text())
+LAYOUT = json.loads((Path(__file__).resolve().parents[2] / "docs/guide/visualization/foxglove_layout.json").read_text())
 PANELS: dict[str, Any] = LAYOUT["configById"]
 
 

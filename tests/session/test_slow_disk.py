@@ -1,4 +1,4 @@
-"""A disk that is slower than the recording: the recorder knows how far it is behind."""
+"""A disk that is slower than the recording: the recorder knows how far it is behind, and loses nothing at its end."""
 
 import os
 import threading
@@ -81,3 +81,23 @@ def test_delay_is_zero_when_all_records_are_stored(tmp_path: Path) -> None:
         while recorder.delay > 0 and time.monotonic() < end:
             time.sleep(0.01)
         assert recorder.delay == 0
+
+
+def test_a_record_that_is_accepted_while_the_recorder_closes_is_stored(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorder = SessionRecorder(tmp_path / "a.mcap", CLOCK).open()
+    closer = threading.Thread(target=recorder.close)
+    put = recorder._queue.put_nowait
+
+    def put_late(item: Any) -> None:
+        """Queue the accepted record when the other thread has closed the recorder, as far as it gets."""
+        closer.start()
+        closer.join(0.5)
+        put(item)
+
+    monkeypatch.setattr(recorder._queue, "put_nowait", put_late)
+    recorder.checks(5.0, [])
+    closer.join()
+    with SessionReader(tmp_path / "a.mcap") as reader:
+        assert reader.counts() == {"/checks": 1}

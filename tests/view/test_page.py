@@ -99,6 +99,8 @@ def test_other_sites_get_no_answer(page: Page) -> None:
     with pytest.raises(InvalidStatus, match="403"):
         websocket(page, origin="http://evil.example")
     assert get(page, Host="evil.example").status == 403
+    assert get(page, Host=f"127.evil.example:{page.port}").status == 403  # a name, whatever its address is
+    assert get(page, Host=f"127.0.0.2:{page.port}").status == 200
     assert get(page, Host=f"localhost:{page.port}").status == 200
 
 

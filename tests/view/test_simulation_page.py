@@ -12,7 +12,8 @@ import gelflow.view
 from gelflow.errors import UsageError
 from gelflow.view import simulation_page
 from gelflow.view.body_text import body_text
-from gelflow.view.joint_sliders import control_ranges, coordinates, read_coordinate, write_coordinate
+from gelflow.view.joint_sliders import Sliders, control_ranges, coordinates, read_coordinate, write_coordinate
+from gelflow.view.page import Page
 from gelflow.view.simulation_page import SimulationPage
 
 MJCF = """<mujoco><compiler angle="radian"/><worldbody><body name="arm">
@@ -135,3 +136,25 @@ def test_wrong_arguments_are_refused() -> None:
         gelflow.view.open(sim, env=3, port=0)
     with pytest.raises(UsageError, match="a Simulator"):
         gelflow.view.open("pushing", port=0)  # type: ignore[arg-type]
+
+
+def test_a_slider_shows_a_value_at_its_upper_end() -> None:
+    low, high = -1.43, 1.75
+    assert low + (high - low) / 500 * 500 < high  # the end of the slider is rounded
+    page = Page(port=0)
+    try:
+        sliders = Sliders(page.gui, "joints", [("joint", high, low, high)], lambda number, value: None, expanded=True)
+        sliders.show([low])
+        sliders.show([high])
+        (handle,) = sliders._handles
+        assert handle.value == pytest.approx(high) and handle.value <= handle.max
+    finally:
+        page.close()
+
+
+def test_bodies_whose_names_contain_slashes_are_drawn_in_the_world(tmp_path: Path) -> None:
+    path = tmp_path / "robot.xml"
+    path.write_text(MJCF.replace('name="arm"', 'name="robot"').replace('name="loose"', 'name="robot/hand"'))
+    with SimulationPage(gs.Simulator(gs.load_scene(path)), port=0, controls=True) as page:
+        names = [node.name for node in page._view._bodies]
+    assert len(set(names)) == 2 and {name.rpartition("/")[0] for name in names} == {"/scene/bodies"}

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from gelflow.errors import SimulationError, UsageError
 from gelflow.policies.calibration.fit import FitResult
 from gelflow.policies.calibration.model.error_model import DRIFT
+from gelflow.policies.calibration.model.parameters import FARTHEST
 from gelflow.policies.calibration.model.reading_model import ReadingModel, displacement_scale
 from gelflow.policies.calibration.model.shear_model import Descents
 from gelflow.policies.calibration.planning.information import Attempts, information, pose_prior, without_pose
@@ -90,7 +91,9 @@ def plan_motions(
         progress(k + 1)
     if not found:
         raise SimulationError("no plan: the attempts cannot be simulated with the parameters of any scenario")
-    before: Array = np.eye(len(readings.fitted)) if fitted is None else np.asarray(np.linalg.inv(fitted.covariance))
+    before: Array = np.eye(len(readings.fitted))
+    if fitted is not None:
+        before = np.asarray(np.linalg.inv(fitted.joint_distribution[1]))
     chosen, gains, after = _greedy(np.stack(found), before, pose_prior(task), count)
     motions = tuple(PlannedMotion(x, y, yaw, task.descent, stop_shear_mm) for x, y, yaw in poses[chosen].tolist())
     names = [p.name for p in readings.fitted]
@@ -117,12 +120,12 @@ def candidates(task: InsertionTask, workspace: tuple[float, float, float] | None
 
 
 def _point(count: int, fitted: FitResult | None, rng: np.random.Generator) -> Array:
-    """Whitened parameters of a scenario."""
-    drawn = rng.normal(size=count)
+    """Whitened parameters of a scenario: of the prior, or of the joint distribution of a fit within its limits."""
+    drawn = np.clip(rng.normal(size=count), -1.7, 1.7)
     if fitted is None:
-        return _SPREAD * np.clip(drawn, -1.7, 1.7)
-    start = fitted.starts[int(rng.integers(len(fitted.starts)))]
-    return np.asarray(start.point[:count] + np.linalg.cholesky(fitted.covariance) @ np.clip(drawn, -1.7, 1.7))
+        return _SPREAD * drawn
+    mean, covariance = fitted.joint_distribution
+    return np.asarray(np.clip(mean + np.linalg.cholesky(covariance) @ drawn, -FARTHEST, FARTHEST))
 
 
 def _stops(readings: ReadingModel, point: Array, poses: Array, stop_shear: float) -> tuple[Array, Array]:

@@ -38,8 +38,9 @@ class Suggestion:
 
 def suggest(problem: Problem, result: FitResult, count: int = 3) -> list[Suggestion]:
     """The `count` attempts with the highest information, the best first."""
-    known = np.linalg.inv(result.covariance)
-    before = np.sqrt(np.diag(result.covariance))
+    covariance = result.joint_distribution[1]
+    known = np.linalg.inv(covariance)
+    before = np.sqrt(np.diag(covariance))
     found = []
     for text, pose, deeper in _CANDIDATES:
         depth = _DEPTH + deeper
@@ -50,7 +51,7 @@ def suggest(problem: Problem, result: FitResult, count: int = 3) -> list[Suggest
             after = np.linalg.inv(known + without_pose(added, pose_prior(problem.recordings.task)))
         except SimulationError:
             continue
-        gain = 0.5 * float(np.linalg.slogdet(result.covariance)[1] - np.linalg.slogdet(after)[1])
+        gain = 0.5 * float(np.linalg.slogdet(covariance)[1] - np.linalg.slogdet(after)[1])
         ratio = np.sqrt(np.diag(after)) / before
         narrowed = {p.name: float(r) for p, r in zip(problem.fitted, ratio, strict=True) if r < 0.9}
         found.append(Suggestion(text, pose, depth, gain, narrowed))

@@ -16,6 +16,7 @@ from gelflow.policies.sweep.run_process import execute
 from gelflow.toml_tables import TomlTable
 
 _POLL = 0.5  # [s, wall]; submitit asks SLURM itself less often
+_UNKNOWN_LIMIT = 600.0  # time from the submission of a job until `sacct` lists it [s, wall]
 _TIME_LIMITS = 1000  # a run may reach the time limit of its job as often; it continues each time
 
 
@@ -124,12 +125,16 @@ class SlurmEngine(Engine):
         except FileNotFoundError:
             return False
         job = self._job_class(self._folder, job_id)
-        if job.done(force_check=True) or job.state == "UNKNOWN":  # unknown: SLURM has forgotten it
+        if job.done(force_check=True) or (job.state == "UNKNOWN" and self._is_forgotten(run)):
             return False
         if arguments:  # earlier versions wrote the id only
             check_arguments(run, tuple(shlex.split(arguments)))
         self._jobs[run.name] = run, job
         return True
+
+    def _is_forgotten(self, run: Run) -> bool:
+        """Whether SLURM has forgotten a job of unknown state: it may not know one yet that was submitted just now."""
+        return time.time() - self._id_file(run).stat().st_mtime > _UNKNOWN_LIMIT
 
 
 class _Job:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import GelflowError
 from gelflow.gel.gel_file import ElasticGel
+from gelflow.geometry import rotated
 from gelflow.helper_process import HelperProcess
 from gelflow.perception.force.image_forces import GridScale, grid_angle
 from gelflow.perception.frames import CameraMount
@@ -124,7 +125,7 @@ class PadForces:
                     begin: dict[str, Any] = {}
                     if used.get(sensor) is not tracked.rest:
                         used[sensor] = tracked.rest
-                        begin = {"angle": _angle(tracked.rest, self._mounts[sensor])}
+                        begin = {"angle": grid_angle(tracked.rest.position, *self._mounts[sensor].image_grid)}
                     self._estimate(sensor, tracked, begin)
         except (OSError, ValueError, GelflowError) as error:  # ValueError: this side has closed the link
             self._end(str(error))
@@ -180,15 +181,14 @@ def _scale(mount: CameraMount) -> GridScale:
     return GridScale(mount.pitch, mount.pixels_per_mm)
 
 
-def _angle(rest: RestingPad, mount: CameraMount) -> float:
-    """Rotation of the grid from the axes of the displacements, which a calibration aligns with the grid [rad]."""
-    return 0.0 if mount.calibration is not None else grid_angle(rest.position, *mount.image_grid)
-
-
 def _request(tracked: _Tracked, mount: CameraMount) -> dict[str, Any]:
-    """A request: displacements (right, down) [mm] from the unloaded pad, shape (markers, 2), and validity."""
+    """A request: displacements (right, down) [mm] from the unloaded pad, in the axes of the image, shape (markers, 2),
+    and validity.
+    """
     displacement = tracked.result.position - tracked.rest.position
     moved = mount.displacement_mm(replace(tracked.result, displacement=displacement))
+    if mount.calibration is not None:  # along rows and columns of the grid
+        moved = rotated(moved, grid_angle(tracked.rest.position, *mount.image_grid))
     valid = tracked.result.valid & tracked.rest.valid
     return {
         "stamp": tracked.image.stamp,

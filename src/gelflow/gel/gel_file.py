@@ -47,18 +47,18 @@ class ElasticGel:
             )
 
 
-def save_gel(gel: ElasticGel, path: Path) -> None:
+def save_gel(gel: ElasticGel, path: str | Path) -> None:
     """Write a new gel file. Raises UsageError if it exists or cannot be written."""
     try:
-        with path.open("x", encoding="utf-8") as file:
+        with Path(path).open("x", encoding="utf-8") as file:
             file.write(toml_text({"format": FORMAT, "gel": asdict(gel)}))
     except OSError as error:
         raise UsageError(f"cannot create {path}: {error.strerror}") from None
 
 
-def load_gel(path: Path) -> ElasticGel:
+def load_gel(path: str | Path) -> ElasticGel:
     """The gel of a TOML file. Raises UsageError if the file is missing or wrong."""
-    table = TomlTable(read_toml(path), str(path))
+    table = TomlTable(read_toml(Path(path)), str(path))
     table.check_keys(("format", "gel"))
     if (written := table.integer("format")) != FORMAT:
         raise UsageError(f"{path} has format {written}; this gelflow reads format {FORMAT}: update gelflow")

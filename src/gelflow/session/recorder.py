@@ -80,6 +80,7 @@ class SessionRecorder:
         self._writing: float | None = None
         self._failure: str | None = None
         self._thread: threading.Thread | None = None
+        self._opened = threading.Lock()  # held from the check that the recorder is open until a record is queued
         self._described = False
         self._finished = False
 
@@ -219,9 +220,10 @@ class SessionRecorder:
 
     def close(self) -> None:
         """Write the index, store all records and close. Raises PeerError when the file cannot be finished."""
-        if self._thread is None:
+        with self._opened:
+            thread, self._thread = self._thread, None
+        if thread is None:
             return
-        thread, self._thread = self._thread, None
         if self._failure is None:
             try:
                 self._queue.put(None, timeout=DISK_TIMEOUT)
@@ -267,14 +269,15 @@ class SessionRecorder:
         return max(0, nanoseconds(stamp) + self._epoch)
 
     def _enqueue(self, item: _Item | threading.Event) -> None:
-        self._check()
-        if self._thread is None:
-            raise UsageError(f"{self.path}: the recorder is not open")
-        try:
-            self._queue.put_nowait((time.monotonic(), item))
-        except queue.Full:
-            self._fail(f"{self._queue.maxsize} records wait for the disk, which is too slow or full")
+        with self._opened:
             self._check()
+            if self._thread is None:
+                raise UsageError(f"{self.path}: the recorder is not open")
+            try:
+                self._queue.put_nowait((time.monotonic(), item))
+            except queue.Full:
+                self._fail(f"{self._queue.maxsize} records wait for the disk, which is too slow or full")
+                self._check()
 
     def _fail(self, reason: str) -> None:
         self._failure = self._failure or reason

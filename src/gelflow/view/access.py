@@ -5,6 +5,7 @@ local page, and WebSockets that another site opens, are therefore refused on eve
 """
 
 import hmac
+import ipaddress
 import secrets
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -13,7 +14,6 @@ from http.cookies import CookieError, SimpleCookie
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
-LOOPBACK = ("127.0.0.1", "localhost", "::1")
 _COOKIE = "gelflow_token"
 _REFUSED = "gelflow: open the address that gelflow printed; its token is missing or wrong.\n"
 _FOREIGN = "gelflow: the request comes from another site.\n"
@@ -21,7 +21,10 @@ _FOREIGN = "gelflow: the request comes from another site.\n"
 
 def is_loopback(host: str) -> bool:
     """Whether only programs of this machine reach the host."""
-    return host in LOOPBACK or host.startswith("127.")
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:  # a name such as 127.evil.example, which the other site resolves
+        return False
 
 
 @dataclass(frozen=True)

@@ -115,11 +115,13 @@ class Sliders:
         expanded: bool,
     ) -> None:
         self._handles: list[Any] = []
-        self._ends = [(low, high) for _, _, low, high in rows]
+        self._ends: list[tuple[float, float]] = []
         with gui.add_folder(title, expand_by_default=expanded):
             for number, (label, value, low, high) in enumerate(rows):
                 step = max((high - low) / _STEPS, 1e-9)
-                handle = gui.add_slider(label, low, low + step * _STEPS, step, min(max(value, low), high))
+                end = low + step * _STEPS  # rounded: it may be below `high`
+                self._ends.append((low, min(high, end)))
+                handle = gui.add_slider(label, low, end, step, min(max(value, low), high, end))
                 handle.on_update(self._moved(number, changed))
                 self._handles.append(handle)
 

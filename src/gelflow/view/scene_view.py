@@ -144,14 +144,14 @@ class SceneView:
     def _make_bodies(self, drawing: SceneDrawing) -> None:
         """Frames of the bodies and their geometries, in place of earlier ones."""
         scene, self._key = self._page.scene, _geometry_key(drawing)
-        names = [body.name for body in self._scene.bodies]
+        names = [f"{number} {_node(body.name)}" for number, body in enumerate(self._scene.bodies)]
         self._bodies = [scene.add_frame(f"{self._root}/bodies/{name}", show_axes=False) for name in names]
         scene.add_frame(f"{self._root}/bodies/world", show_axes=False)
         for number, geom in enumerate(drawing.geoms):
             self._add_geom(number, geom, "world" if geom.body == WORLD else names[geom.body])
 
     def _add_geom(self, number: int, geom: GeomDef, body: str) -> None:
-        name = f"{self._root}/bodies/{body}/{number} {geom.name.replace('/', ' ')}"
+        name = f"{self._root}/bodies/{body}/{number} {_node(geom.name)}"
         pose = {"position": geom.pose.position, "wxyz": geom.pose.quaternion}
         if geom.kind == "plane":
             size, tile = 7 * self._camera.distance, round_scale(self._camera.distance / _TILES / 2)
@@ -207,7 +207,7 @@ class SceneView:
             tip = contact.point + length * contact.force
             text = f"{name}: {quantity(float(np.linalg.norm(contact.force)), 'N')}"
             if name not in self._labels:
-                path = f"{self._root}/force labels/{name}"
+                path = f"{self._root}/force labels/{len(self._labels)} {_node(name)}"
                 self._labels[name] = self._page.scene.add_label(path, text, position=tip, font_screen_scale=0.9)
             elif due and self._labels[name].text != text:
                 self._labels[name].text = text
@@ -237,6 +237,11 @@ class SceneView:
 
 def _geometry_key(drawing: SceneDrawing) -> tuple[bytes, ...]:
     return tuple(part.tobytes() for geom in drawing.geoms for part in (geom.size, geom.pose.position))
+
+
+def _node(name: str) -> str:
+    """A name as that of a node; viser would draw "a/b" relative to "a"."""
+    return name.replace("/", " ")
 
 
 def _linear(color: tuple[int, int, int]) -> tuple[int, int, int]:

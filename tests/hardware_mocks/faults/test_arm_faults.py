@@ -14,6 +14,8 @@ from google.protobuf.message import DecodeError
 from gelflow.clock import ScaledClock
 from gelflow.hardware_mocks.egm.controller import MockEgmConfig
 from gelflow.hardware_mocks.egm.device import MockEgmArm
+from gelflow.hardware_mocks.faults.injector import Devices
+from gelflow.hardware_mocks.faults.plan import Fault
 from gelflow.hardware_mocks.plant import KinematicArm
 
 START = np.array([0.40, 0.0, 0.30])
@@ -194,3 +196,19 @@ def test_restarted_count_begins_at_zero(bench: Bench) -> None:
     bench.many(20)
     bench.arm.restart_sequence()
     assert min(sequence(bench.many(20))) < 10
+
+
+def test_a_disconnected_arm_is_silent_until_the_last_fault_ends(bench: Bench) -> None:
+    devices = Devices(bench.arm, None, (), None)  # type: ignore[arg-type]
+    faults = [Fault("arm", "disconnect", at=1, duration=duration) for duration in (math.inf, 0.001)]
+    for number, fault in enumerate(faults):
+        devices.begin(number, fault)
+    devices.end(1, faults[1])
+    sent = bench.arm.report.sent
+    bench.socket.settimeout(0.25)
+    with pytest.raises(TimeoutError):
+        bench.many(200, goal=0.0)
+    assert bench.arm.report.sent == sent and bench.arm.report.answers == 0
+    devices.end(0, faults[0])
+    bench.socket.settimeout(5.0)
+    bench.receive()

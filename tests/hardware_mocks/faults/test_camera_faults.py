@@ -7,6 +7,8 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
+from urllib.error import HTTPError
+from urllib.request import urlopen
 
 import cv2
 import numpy as np
@@ -14,6 +16,7 @@ import pytest
 from numpy.typing import NDArray
 
 from gelflow.clock import ScaledClock
+from gelflow.errors import PeerError
 from gelflow.hardware_mocks.camera.device import MockMjpegCamera
 
 CLOCK = ScaledClock(1.0)
@@ -191,3 +194,15 @@ def test_garbage_stands_between_the_parts() -> None:
         complete = sum(jpeg in rest for jpeg in source.made)
         assert complete >= 3
         assert len(rest) > sum(len(jpeg) for jpeg in source.made if jpeg in rest) + 250 * complete
+
+
+def test_a_snapshot_of_a_failed_source_is_refused() -> None:
+    def fail() -> bytes:
+        raise ValueError("no image")
+
+    camera = MockMjpegCamera(fail, CLOCK).start()
+    for _ in range(2):  # when the source fails, and afterwards
+        with pytest.raises(HTTPError, match="503"):
+            urlopen(camera.url.replace("stream", "snapshot"), timeout=20)
+    with pytest.raises(PeerError, match="ValueError: no image"):
+        camera.close()

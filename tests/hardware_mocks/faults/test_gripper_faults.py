@@ -175,3 +175,21 @@ def test_dropped_commands_are_not_answered() -> None:
             gripper.end_fault(2)
             os.write(link.fileno(), WIDTH_EVERY_20_MS)
             assert packets(client.read(0.3)) > 4
+
+
+def test_delayed_commands_of_a_client_end_with_its_connection() -> None:
+    def echo(text: bytes) -> bytes:
+        whole = PREAMBLE + struct.pack("<BH", 0x06, len(text)) + text
+        return whole + struct.pack("<H", checksum(whole))
+
+    with MockWsgGripper(KinematicGripper(CLOCK), clock=CLOCK, tcp_port=0) as gripper:
+        gripper.begin_fault(2, "delay", "in", {"delay": 0.3, "share": 1.0, "seed": 1})
+        with socket.create_connection(gripper.tcp_address) as first:
+            first.sendall(echo(b"first"))
+        with socket.create_connection(gripper.tcp_address, 20.0) as second:
+            second.sendall(echo(b"second"))
+            received = b""
+            while b"second" not in received:
+                received += (data := second.recv(4096))
+                assert data
+        assert b"first" not in received

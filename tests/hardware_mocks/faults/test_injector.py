@@ -10,8 +10,10 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pytest
 
 from gelflow.clock import ScaledClock
+from gelflow.errors import UsageError
 from gelflow.hardware_mocks.faults.injector import Devices, Occurrence
 from gelflow.hardware_mocks.faults.plan import Fault, FaultPlan
 from gelflow.hardware_mocks.robot import MockRobot, MockRobotConfig
@@ -129,3 +131,27 @@ def test_overlapping_faults_end_one_by_one() -> None:
     assert cell.calls[-1] == ("change_world", (), {"gel_stiffness": 5.0, "pad_friction": 0.2})
     devices.end(2, stiff)
     assert cell.calls[-1] == ("change_world", (), {"gel_stiffness": 1.0, "pad_friction": 0.2})
+
+
+class RefusingCell:
+    """Refuses a stiffness of the gels above 10."""
+
+    def __init__(self) -> None:
+        self.stiffness = 1.0
+
+    def change_world(self, *, gel_stiffness: float, pad_friction: float) -> None:
+        if gel_stiffness > 10:
+            raise UsageError("too stiff")
+        self.stiffness = gel_stiffness
+
+
+def test_a_refused_world_does_not_act_on_later_faults() -> None:
+    cell = RefusingCell()
+    devices = Devices(RecordingDevice(), RecordingDevice(), (), cell)  # type: ignore[arg-type]
+    refused = Fault("world", "stiff_gel", at=1, parameters={"factor": 20.0})
+    with pytest.raises(UsageError, match="too stiff"):
+        devices.begin(0, refused)
+    devices.begin(1, Fault("world", "stiff_gel", at=1))
+    assert cell.stiffness == 5.0
+    devices.end(0, refused)
+    assert cell.stiffness == 5.0

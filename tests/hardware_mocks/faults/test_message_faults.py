@@ -80,3 +80,14 @@ def test_garbage_precedes_the_message() -> None:
 def test_equal_seeds_give_equal_faults(kind: str) -> None:
     runs = [passed(MessageFault(kind, share=0.5, seed=9), ordered=False) for _ in range(2)]
     assert runs[0] == runs[1]
+
+
+def test_messages_that_wait_are_dropped_at_the_end_of_a_connection() -> None:
+    for kind in ("delay", "reorder"):
+        faults = MessageFaults(ordered=True)
+        faults.begin(1, MessageFault(kind))
+        faults.put(b"old", 0.0)
+        faults.clear()
+        faults.put(b"new", 1.0)
+        faults.end(1)
+        assert faults.take(10.0) == [b"new"]

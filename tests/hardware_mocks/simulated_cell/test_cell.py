@@ -1,6 +1,8 @@
 """Simulated cell: simulated operator, gripper drive, marker displacements, ground truth."""
 
 import math
+import os
+import signal
 import threading
 import time
 from collections.abc import Callable
@@ -13,8 +15,10 @@ from tests.hardware_mocks.simulated_cell.harness import aligned_pose, go, graspe
 
 from gelflow.clock import ScaledClock
 from gelflow.errors import SimulationError, UsageError
+from gelflow.hardware_mocks.simulated_cell import process
 from gelflow.hardware_mocks.simulated_cell.cell import SimulatedCell, SimulatedCellConfig
 from gelflow.hardware_mocks.simulated_cell.process import SimulatedCellProcess
+from gelflow.hardware_mocks.simulated_cell.world import Gels, World
 from gelflow.task import INSERTION
 from gelflow.time_sync import TimeSync
 
@@ -169,4 +173,34 @@ def test_failed_simulation_is_reported() -> None:
     with pytest.raises(SimulationError, match="the arm cannot move to"):
         remote.truth()
     with pytest.raises(SimulationError, match="failed"):
+        remote.stop()
+
+
+def test_a_late_answer_is_not_taken_for_the_next_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    with SimulatedCellProcess(ScaledClock(4.0)) as remote:
+        assert remote._helper is not None
+        with monkeypatch.context() as patience:
+            patience.setattr(process, "_ANSWER_LIMIT", 0.05)
+            os.kill(remote._helper.pid, signal.SIGSTOP)
+            os.waitpid(remote._helper.pid, os.WUNTRACED)  # all its threads have stopped
+            with pytest.raises(SimulationError, match="did not answer"):
+                remote.next_seed(3)
+            os.kill(remote._helper.pid, signal.SIGCONT)
+        assert remote.truth()["parts"] == remote.truth()["parts"]
+
+
+def test_a_world_beyond_its_limits_is_refused_and_the_cell_goes_on() -> None:
+    config = SimulatedCellConfig(world=World(gels=Gels(left=60.0)))
+    with SimulatedCellProcess(ScaledClock(4.0), config) as remote:
+        with pytest.raises(UsageError, match=r"left must be within 0\.001 to 2500, got 3000"):
+            remote.change_world(gel_stiffness=50.0, pad_friction=1.0)
+        remote.change_world(gel_stiffness=5.0, pad_friction=1.0)
+
+
+def test_a_cell_that_fails_during_an_answer_is_reported() -> None:
+    remote = SimulatedCellProcess(ScaledClock(4.0)).start()
+    with pytest.raises(SimulationError, match="has ended"):
+        remote._ask({"ask": "no question"})
+    wait_for(lambda: remote._helper is not None and not remote._helper.running)
+    with pytest.raises(SimulationError, match="failed: exit status 1: KeyError: 'no question'"):
         remote.stop()

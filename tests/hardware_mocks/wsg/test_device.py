@@ -343,3 +343,18 @@ def test_misuse_of_the_mock_raises_usage_error() -> None:
         with pytest.raises(UsageError, match="already open"):
             mock.open()
         assert mock.addresses == (f"serial:{mock.serial_path}", f"tcp:127.0.0.1:{mock.tcp_address[1]}")
+
+
+def test_a_part_stays_clamped_however_often_the_fingers_are_stopped() -> None:
+    with serving() as (mock, plant), line(mock) as client:
+        client.result(HOME, "<B", 1)
+        plant.set_part(0.020)
+        assert client.ask(0x32, "<f", 25.0)[0] == SUCCESS
+        assert client.result(GRASP, "<ff", 20.0, 200.0) == SUCCESS
+        for command in (STOP, STOP, FAST_STOP, FAST_STOP):
+            assert client.ask(command)[0] == SUCCESS
+            assert plant.gripper_state()[2] == 25.0
+        assert client.ask(ACK, "<3s", b"ack")[0] == SUCCESS
+        assert client.result(RELEASE, "<ff", 60.0, 400.0) == SUCCESS
+        assert client.ask(STOP)[0] == SUCCESS
+        assert plant.gripper_state()[2] == 0.0

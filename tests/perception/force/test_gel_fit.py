@@ -198,6 +198,8 @@ def test_contacts_that_disagree_make_the_thickness_doubtful(
         ("stamp,normal_n\n0,1\n9,5,3\n", "row 2 has more cells"),
         ("stamp,normal_n,normal_n\n0,1,5\n9,2,5\n", "has the column normal_n twice"),
         ("image,normal_n\n10.jpg,1\n10.jpg,2\n", "normal_n of 10.jpg is there twice"),
+        ("normal_n,image\n1,9.jpg\n2\n2\n", "row 2 has no image"),
+        ("image,normal_n\n,1\n9.jpg,2\n", "row 1 has no image"),
         ("stamp,normal_n\n0,1e300\n9,1e300\n", "normal_n is 1e.300; forces are in newtons"),
         ("stamp,normal_n\n0,1e-300\n9,1e-300\n", "times the estimates; are they in newtons"),
     ],
@@ -226,6 +228,13 @@ def test_estimates_whose_time_jumps_back_are_refused(layer: PressedLayer, tmp_pa
     estimates.write_text("\n".join([head, *rows[60:], *rows[:60]]))
     with pytest.raises(UsageError, match=r"a\.forces\.csv: stamps must not decrease"):
         read_samples(estimates, scale)
+
+
+def test_estimates_without_normal_forces_are_refused(layer: PressedLayer, tmp_path: Path) -> None:
+    samples = read_samples(*record(layer, tmp_path))
+    unknown = np.full_like(samples.measured_normal, np.nan)
+    with pytest.raises(UsageError, match="normal force of every image with contact is 0: press harder"):
+        fit_gel(replace(samples, normal=0 * samples.normal, measured_normal=unknown), GUESS)
 
 
 def test_estimates_with_a_lag_are_refused(layer: PressedLayer, tmp_path: Path) -> None:

@@ -1,6 +1,8 @@
 """Forces on a pad whose grid is rotated in the image: those of the upright grid, in the axes of the image."""
 
+import re
 import time
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,9 +11,11 @@ from numpy.typing import NDArray
 
 from gelflow.gel.gel_file import ElasticGel
 from gelflow.observation import Grid
+from gelflow.perception.camera_calibration import CameraCalibration, fit_calibration
 from gelflow.perception.force.estimator import ForceEstimate
 from gelflow.perception.force.image_forces import GridScale, ImageForces, grid_angle
 from gelflow.perception.frames import CameraMount
+from gelflow.perception.output.forces import force_text
 from gelflow.perception.synthetic.pressed_layer import Press, PressedLayer
 from gelflow.perception.tracker import TrackingResult
 from gelflow.protocols import CameraImage
@@ -65,6 +69,19 @@ def test_a_rotated_grid_has_the_forces_of_the_upright_one(moved: NDArray[np.floa
     assert (found.shear_deviation > 0.9 * upright.shear_deviation.min()).all()
 
 
+@pytest.mark.parametrize("angle", [0.0, ANGLE, np.radians(45)])
+def test_an_uncertain_modulus_is_one_factor_of_all_forces(moved: NDArray[np.float64], angle: float) -> None:
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    guess = replace(GEL, youngs_modulus_deviation=0.5)
+    found = ImageForces(guess, 10, 13, GridScale(1.5, SCALE), angle).estimate(moved @ turn.T, VALID, 0.0)
+    assert found is not None
+    tolerance = 0.05 * float(np.linalg.norm(found.shear))
+    np.testing.assert_allclose(found.shear_deviation, 0.5 * np.abs(found.shear), atol=tolerance)
+    printed = re.search(r"shear (\S+) \+- (\S+) N", force_text(found))
+    assert printed is not None
+    assert float(printed[2]) == pytest.approx(0.5 * float(printed[1]), rel=0.05, abs=0.01)
+
+
 class Recorder:
     """Accepts forces and events."""
 
@@ -75,11 +92,21 @@ class Recorder:
         raise AssertionError(f"{name}: {values}")
 
 
-def test_the_forces_of_a_run_are_in_the_axes_of_the_image(moved: NDArray[np.float64], upright: ForceEstimate) -> None:
+def calibrated() -> CameraCalibration:
+    return fit_calibration(rotated(REST), VALID, rows=10, cols=13, spacing_mm=1.5, size=(640, 480))
+
+
+@pytest.mark.parametrize(
+    "mount",
+    [CameraMount(10, 13, 1.5, pixels_per_mm=SCALE), CameraMount(10, 13, 1.5, calibration=calibrated())],
+    ids=["scale", "calibration"],
+)
+def test_the_forces_of_a_run_are_in_the_axes_of_the_image(
+    mount: CameraMount, moved: NDArray[np.float64], upright: ForceEstimate
+) -> None:
     position = rotated(REST) + SCALE * rotated(moved)
-    seen = TrackingResult(position, np.zeros_like(REST), VALID, ~VALID, VALID * 1.0, 10, 13, 1.5 * SCALE)
+    seen = TrackingResult(position, SCALE * rotated(moved), VALID, ~VALID, VALID * 1.0, 10, 13, 1.5 * SCALE)
     image = CameraImage(b"", 10.0, 1)
-    mount = CameraMount(10, 13, 1.5, pixels_per_mm=SCALE)
     record, end = None, time.monotonic() + WAIT
     with PadForces([GEL], [mount], Recorder()) as forces:  # type: ignore[arg-type]
         forces.set_rest([RestingPad(rotated(REST), VALID)])

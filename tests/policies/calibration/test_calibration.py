@@ -1,13 +1,19 @@
 """Calibration: exact derivatives, the training environment as a world with known truth, transfer matrix, reports."""
 
+import contextlib
 import dataclasses
 import json
+from concurrent.futures import Future
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from tests.policies.calibration.recorded_world import LITTLE, WORLD
 
+from gelflow.errors import SimulationError
 from gelflow.observation import Grid
 from gelflow.perception.frames import CameraMount
 from gelflow.policies.calibration.calibrated_scene import write_scene
@@ -202,6 +208,20 @@ def test_a_fit_is_reproducible(world: RecordedWorld) -> None:
     settings = FitSettings(starts=1, members=8, nearby=8, poses=4, steps=1)
     first, second = (fit(world.recordings.of(np.array([0])), seed=1, settings=settings) for _ in range(2))
     np.testing.assert_array_equal(first.best.point, second.best.point)
+
+
+def test_a_killed_process_of_the_fit_is_an_error_in_one_line(
+    world: RecordedWorld, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def submit(*arguments: Any) -> "Future[None]":
+        future: Future[None] = Future()
+        future.set_exception(BrokenProcessPool("terminated abruptly"))
+        return future
+
+    pool = SimpleNamespace(submit=submit)
+    monkeypatch.setattr("gelflow.policies.calibration.fit.worker_pool", lambda count: contextlib.nullcontext(pool))
+    with pytest.raises(SimulationError, match=r"a process of the fit was killed, .* close other programs"):
+        fit(world.recordings.of(np.array([0])), processes=2)
 
 
 def test_the_report_is_one_self_contained_page(calibrated: Calibration) -> None:

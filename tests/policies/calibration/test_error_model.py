@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from tests.policies.calibration.recorded_world import LITTLE
 
+from gelflow.errors import UsageError
 from gelflow.policies.calibration.calibration import calibrate
 from gelflow.policies.calibration.experiment.worlds import RecordedWorld
 from gelflow.policies.calibration.model.error_model import ErrorModel
@@ -52,6 +53,15 @@ def test_noisy_markers_are_those_of_all_insertions(world: RecordedWorld) -> None
     recordings = with_noise(world.recordings, 10.0)
     part = recordings.of(np.array([4]))
     np.testing.assert_array_equal(part.used, recordings.used)
+
+
+@pytest.mark.parametrize("pad", [0, 1])
+def test_a_pad_without_a_compared_marker_is_an_error(world: RecordedWorld, pad: int) -> None:
+    used = np.ones((2, 130), dtype=bool)
+    used[pad] = False
+    recordings = dataclasses.replace(world.recordings, used=used.reshape(-1))
+    with pytest.raises(UsageError, match="no marker of a pad can be compared: its camera shows too few lines"):
+        Problem(recordings, threads=1)
 
 
 @pytest.mark.slow

@@ -1,24 +1,30 @@
 """Plans of attempts: files, the information of attempts, and the covariance that plans and intervals rest on."""
 
+import dataclasses
+from argparse import Namespace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from tests.policies.calibration.recorded_world import WORLD
 
+from gelflow.cli.commands.calibrate import _run_command
 from gelflow.cli.main import main
 from gelflow.errors import UsageError
 from gelflow.policies.calibration.experiment.planned import expected_widths
 from gelflow.policies.calibration.experiment.worlds import RecordedWorld, record_world
 from gelflow.policies.calibration.fit import FitResult, StartResult
+from gelflow.policies.calibration.model.parameters import FARTHEST
 from gelflow.policies.calibration.model.reading_model import ReadingModel
 from gelflow.policies.calibration.model.shear_model import Descents
 from gelflow.policies.calibration.planning.information import Attempts, information, pose_prior, without_pose
 from gelflow.policies.calibration.planning.motions import STOP_SHEAR_MM, plan_motions
+from gelflow.policies.calibration.planning.suggestions import suggest
 from gelflow.policies.calibration.problem import POSE_STEP, Problem, in_hole
 from gelflow.policies.calibration.session_recordings import nothing_recorded
 from gelflow.policies.calibration.uncertainty import covariance
 from gelflow.session.motion_plan import PlannedMotion, load_motion_plan, save_motion_plan
+from gelflow.sim.tasks.parts import load_part
 from gelflow.task import INSERTION
 
 LAB = nothing_recorded(INSERTION, grasp_force=12.0, grasp_height=0.0)
@@ -105,6 +111,31 @@ def test_a_plan_depends_on_what_is_known_already() -> None:
     assert all(after <= before < 0.1 for before, after in plan.widths.values())
 
 
+def test_no_direction_of_a_fit_is_wider_than_its_prior(world: RecordedWorld, monkeypatch: pytest.MonkeyPatch) -> None:
+    count = len(ReadingModel(LAB).fitted)
+    points: list[np.ndarray] = []
+
+    def stops(readings: ReadingModel, point: np.ndarray, poses: np.ndarray, shear: float) -> tuple[np.ndarray, ...]:
+        points.append(point)
+        return np.full(len(poses), 1e-3), np.ones(len(poses))
+
+    def informed(readings: ReadingModel, point: np.ndarray, attempts: Attempts, *errors: float) -> np.ndarray:
+        return np.tile(4.0 * np.eye(count + 3), (len(attempts.depth), 1, 1))
+
+    monkeypatch.setattr("gelflow.policies.calibration.planning.motions._stops", stops)
+    monkeypatch.setattr("gelflow.policies.calibration.planning.motions.information", informed)
+    monkeypatch.setattr("gelflow.policies.calibration.planning.suggestions.information", informed)
+    end = StartResult(np.full(count, 3.9), np.zeros((1, 3)), 9.0 * np.eye(count), 0.0, 1.0, 1e-3)
+    fitted = FitResult((end,), count)
+    plan = plan_motions(LAB, fitted=fitted, count=1, workspace=NEAR)
+    assert 3.9 < np.max(points) <= FARTHEST
+    expected = 0.5 * count * np.log(5)  # of four times the information of the prior
+    assert plan.gains[0] == pytest.approx(expected)
+    assert list(plan.widths.values()) == [pytest.approx((1.0, 1 / np.sqrt(5)))] * count
+    suggestions = suggest(Problem(world.recordings.of(np.array([0])), threads=1), fitted)
+    assert [s.gain for s in suggestions] == pytest.approx([expected] * 3)
+
+
 def test_planned_attempts_are_made_on_one_part_of_the_same_world(world: RecordedWorld) -> None:
     planned = record_world(WORLD, plan=[PlannedMotion(9e-3, 0.0, 0.0, 1.1e-3), PlannedMotion(0.0, 9e-3, 0.0, 1.1e-3)])
     assert planned.truth == world.truth
@@ -140,6 +171,20 @@ def test_unknown_poses_widen_the_intervals(world: RecordedWorld) -> None:
     np.testing.assert_allclose(free, free.T)
     assert np.linalg.eigvalsh(free - fixed).min() > -1e-9
     assert np.trace(free[:count, :count]) > 1.01 * np.trace(fixed[:count, :count])
+
+
+def test_the_command_of_a_plan_names_only_parts_that_come_with_gelflow() -> None:
+    peg = load_part("peg").part
+    args = Namespace(lab=None, plan=Path("plan.toml"), part=None)
+    longer = dataclasses.replace(peg, size=(*peg.size[:2], peg.size[2] + 1e-3))
+    for part, words in (
+        (INSERTION.part, ""),
+        (peg, "--part peg "),
+        (dataclasses.replace(peg, name="bolt"), "--part PART.toml "),
+        (longer, "--part PART.toml "),
+    ):
+        command = f"gelflow run insertion --lab LAB {words}--plan plan.toml --insertions 2"
+        assert _run_command(args, part) == command
 
 
 def test_calibrate_refuses_contradicting_options(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

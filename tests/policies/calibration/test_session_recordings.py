@@ -17,7 +17,9 @@ from gelflow.clock import ScaledClock
 from gelflow.errors import UsageError
 from gelflow.perception.frames import CameraMount
 from gelflow.policies.calibration.calibrated_scene import write_scene
+from gelflow.policies.calibration.comparison import SimulatedSession
 from gelflow.policies.calibration.experiment.worlds import RecordedWorld
+from gelflow.policies.calibration.recordings import Recordings
 from gelflow.policies.calibration.session_recordings import read_recordings
 from gelflow.session import SessionRecorder
 from gelflow.session.records import Decision, describe_session
@@ -197,6 +199,27 @@ def test_replay_compares_flow_maps_with_the_simulation(
     assert picture.read_bytes().startswith(b"\x89PNG")
     assert main(["replay", str(session), "--simulate", "--checkpoint", "x.safetensors"]) == 2
     assert "leave one of them out" in capsys.readouterr().err
+
+
+def test_replay_prints_the_errors_before_it_saves_the_picture(
+    tmp_path: Path, world: RecordedWorld, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def simulated(recordings: Recordings, **options: Any) -> SimulatedSession:
+        flow = recordings.flow.reshape(len(recordings), -1, 2)
+        return SimulatedSession(flow, flow, recordings.used)
+
+    def full(*arguments: Any, **options: Any) -> None:
+        raise UsageError("No space left on device")
+
+    monkeypatch.setattr("gelflow.cli.simulated_replay.simulate", simulated)
+    monkeypatch.setattr("gelflow.cli.simulated_replay.save", full)
+    command = ["replay", str(write_session(tmp_path / "a.mcap", world)), "--simulate", "--out", str(tmp_path / "a.png")]
+    assert main([*command, "--json"]) == 2
+    printed = capsys.readouterr()
+    assert json.loads(printed.out)["error"] == 0 and "No space left" in printed.err
+    assert main(command) == 2
+    printed = capsys.readouterr()
+    assert "root mean square error 0 mm" in printed.out and "picture" not in printed.out
 
 
 def test_replay_warns_of_flow_maps_with_nothing_in_common(

@@ -1,13 +1,15 @@
 """A quick stand-in for `gelflow train`: the same options, files and result, and steps that continue after a kill.
 
 Test hooks in the folder of the sweep: the run waits in its middle while the file `hold` exists; it fails with exit code
-3 while `fail` exists, and with exit code 2 while `refuse` exists.
+3 while `fail` exists, and with exit code 2 while `refuse` exists. With `crash` it is killed after it printed its
+result. With `full` it deletes this file and ends without a result, as on a full disk.
 """
 
 import argparse
 import csv
 import json
 import os
+import signal
 import sys
 import time
 from pathlib import Path
@@ -31,8 +33,6 @@ def main() -> None:
             sys.exit(fail(f"asked to {name}", code))
     state = args.out / "state.json"
     done = json.loads(state.read_text()) if state.exists() else []
-    if len(done) == STEPS:
-        sys.exit(fail("the run is complete already", 2))
     for step in range(len(done), STEPS):
         done.append([step, args.rate * (step + args.seed), os.getpid()])
         partial = state.with_suffix(".part")
@@ -43,7 +43,12 @@ def main() -> None:
     table = args.out / "learning_curve.csv"
     with table.open("w", newline="") as file:
         csv.writer(file).writerows([("steps", "success"), *(row[:2] for row in done)])
-    print(json.dumps({"learning_curve": str(table), "validation": {"success": done[-1][1]}}))
+    if (hooks / "full").exists():
+        (hooks / "full").unlink()
+        sys.exit(fail("No space left on device", 2))
+    print(json.dumps({"learning_curve": str(table), "validation": {"success": done[-1][1]}}), flush=True)
+    if (hooks / "crash").exists():
+        os.kill(os.getpid(), signal.SIGKILL)
 
 
 def fail(message: str, code: int) -> int:

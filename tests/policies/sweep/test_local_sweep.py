@@ -86,6 +86,17 @@ def test_exit_code_2_is_tried_again(tmp_path: Path) -> None:
     assert read_record(run).error == "exit code 2: asked to refuse"
 
 
+@pytest.mark.parametrize(("hook", "starts"), [("crash", 1), ("full", 2)])
+def test_a_finished_run_with_a_lost_exit_code_or_result_completes(tmp_path: Path, hook: str, starts: int) -> None:
+    (run,) = make_runs(tmp_path)[:1]
+    run.folder.mkdir()
+    (run.folder / hook).touch()
+    ended = sweep([run], two, tries=2)
+    assert ended == [*[(run.name, "failed", True)] * (starts - 1), (run.name, "complete", False)]
+    record = read_record(run)
+    assert record.starts == starts and record.result["validation"] == {"success": 18.0}
+
+
 def test_at_most_one_process_executes_a_run(tmp_path: Path) -> None:
     (run,) = make_runs(tmp_path)[:1]
     with sweep_folder(run.folder):

@@ -1,6 +1,7 @@
 """Rows, summary and learning curves of a sweep."""
 
 import csv
+import dataclasses
 import io
 from pathlib import Path
 from typing import Any
@@ -40,6 +41,25 @@ def test_a_row_has_options_state_and_results(tmp_path: Path) -> None:
     with (tmp_path / "rows.csv").open() as file:
         (read,) = csv.DictReader(file)
     assert read["validation.success"] == "0.5"
+
+
+def test_an_option_with_the_name_of_another_column_has_a_column_of_its_own(tmp_path: Path) -> None:
+    runs, records = sweep_of(tmp_path, {("fast", 0): [(0, 0.0, ""), (1, 0.5, "")]})
+    options = {"steps": 10_000, "minutes": 5.0, "preset": "fast"}
+    runs = [dataclasses.replace(run, values=options) for run in runs]
+    for record in records.values():
+        record.result.update({"steps": 10_240, "minutes": 0.5})
+    (row,), found = results.rows(runs, records), results.configurations(runs, records)
+    assert (row["option.steps"], row["option.minutes"], row["preset"]) == (10_000, 5.0, "fast")
+    assert (row["steps"], row["minutes"]) == (10_240, 0.5)
+    (summary,) = results.summary_rows(found)
+    assert summary["option.steps"] == 10_000 and summary["steps median"] == 10_240
+    drawn = curves.read_curves(runs, records)
+    assert drawn is not None
+    assert [(point["option.steps"], point["steps"]) for point in drawn.rows()] == [(10_000, 0), (10_000, 1)]
+    console = Console(width=120, record=True, file=io.StringIO())
+    console.print(summary_table(found, console))
+    assert "option.steps" in console.export_text()
 
 
 def test_a_configuration_has_median_and_range_of_its_complete_runs(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import time
 from pathlib import Path
 
 import pytest
@@ -56,25 +57,43 @@ def test_a_run_continues_after_the_time_limit_of_its_job(tmp_path: Path) -> None
     assert_resumed(runs[0])
 
 
-def test_a_pending_job_is_not_submitted_twice_and_its_options_are_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The commands of SLURM are scripts: each job stays in the queue."""
+def slurm_scripts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, states: str) -> Path:
+    """Scripts as the commands of SLURM, with these lines of states; the file with a line for each submitted job."""
     scripts, submitted = tmp_path / "bin", tmp_path / "submitted"
     scripts.mkdir()
     for name, text in (
         ("srun", ""),
         ("sbatch", f"echo job >> '{submitted}'\necho Submitted batch job 7\n"),
-        ("sacct", "echo 'JobID|State|NodeList'\necho '7|PENDING|None assigned'\n"),
+        ("sacct", f"echo 'JobID|State|NodeList'\n{states}"),
     ):
         (scripts / name).write_text(f"#!/bin/sh\n{text}")
         (scripts / name).chmod(0o755)
     monkeypatch.setenv("PATH", os.pathsep.join([str(scripts), os.environ["PATH"]]))
+    return submitted
 
-    def submit(run: Run) -> None:
-        with SlurmEngine(run.folder, SlurmSettings(), cpus=1) as engine:
-            engine.submit([run])
 
+def submit(run: Run) -> None:
+    with SlurmEngine(run.folder, SlurmSettings(), cpus=1) as engine:
+        engine.submit([run])
+
+
+def test_a_job_that_slurm_does_not_know_yet_is_not_submitted_twice(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    submitted, run = slurm_scripts(tmp_path, monkeypatch, states=""), make_runs(tmp_path)[0]
+    submit(run)
+    submit(run)
+    assert submitted.read_text() == "job\n"
+    os.utime(run.folder / "jobs" / f"{run.name}.id", (time.time() - 900, time.time() - 900))
+    submit(run)  # after a quarter of an hour it is forgotten
+    assert submitted.read_text() == "job\njob\n"
+
+
+def test_a_pending_job_is_not_submitted_twice_and_its_options_are_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The commands of SLURM are scripts: each job stays in the queue."""
+    submitted = slurm_scripts(tmp_path, monkeypatch, states="echo '7|PENDING|None assigned'\n")
     run = make_runs(tmp_path)[0]
     submit(run)
     submit(run)

@@ -59,6 +59,39 @@ def test_a_refused_sweep_keeps_the_stored_grid_file(tmp_path: Path, capsys: pyte
     assert (out / "grid.toml").read_text() == GRID
 
 
+def complete_sweep(tmp_path: Path, text: str) -> list[str]:
+    """The command of a sweep with one run, which is complete already."""
+    grid, out = tmp_path / "grid.toml", tmp_path / "sweep"
+    grid.write_text(text)
+    (run,) = read_grid(grid, train_options()).runs(out)
+    (tmp_path / "progress.csv").write_text("steps,success\n0,0.5\n")
+    run.record.parent.mkdir(parents=True)
+    result = {"learning_curve": str(tmp_path / "progress.csv"), "validation": {"success": 0.5}}
+    write_record(run, RunRecord(run.name, run.arguments, "complete", 1, "host", 60.0, 0, "", result))
+    return ["sweep", str(grid), "--out", str(out), "--json"]
+
+
+def test_results_are_printed_before_the_error_of_a_wrong_curve(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = complete_sweep(tmp_path, 'task = "insertion"\ncurve = "sucess"\n')
+    assert main(command) == 2
+    printed = capsys.readouterr()
+    assert json.loads(printed.out)["runs"][0]["validation.success"] == 0.5
+    assert "learning curves have no column 'sucess'; did you mean 'success'" in printed.err
+    assert set(json.loads(printed.out)["files"]) == {"runs", "summary"}
+
+
+def test_results_are_printed_where_a_table_cannot_be_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = complete_sweep(tmp_path, 'task = "insertion"\n')
+    (tmp_path / "sweep" / "runs.csv").mkdir()
+    assert main(command) == 2
+    printed = capsys.readouterr()
+    assert json.loads(printed.out)["complete"] == 1 and "runs.csv" in printed.err
+
+
 def test_a_grid_file_of_something_else_is_not_replaced(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "tiny.toml").write_text(GRID)
     (tmp_path / "grid.toml").write_text("mine = 1\n")

@@ -1,6 +1,7 @@
 """A recorded session at any time: markers relative to the start of the attempt, heights, events, texts, pictures."""
 
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
@@ -29,6 +30,7 @@ from gelflow.task import INSERTION
 from gelflow.view.session.curves import Curves, read_curves
 from gelflow.view.session.pad_pictures import decision_picture, pads_picture
 from gelflow.view.session.recorded_session import RecordedSession
+from gelflow.view.session.session_page import SessionPage
 from gelflow.view.session.snapshot_text import comparison_text, snapshot_text
 from gelflow.view.session.timeline import HEIGHT, WIDTH, Timeline
 
@@ -340,3 +342,43 @@ def test_a_session_that_is_being_recorded_grows(tmp_path: Path) -> None:
             recorder.close()
             session.refresh()
             assert not session.growing
+
+
+class Steps(threading.Event):
+    """Ends no reading; each wait of the reader does the next step instead."""
+
+    def __init__(self, *steps: Callable[[], object]) -> None:
+        super().__init__()
+        self._steps = iter(steps)
+
+    def wait(self, timeout: float | None = None) -> bool:
+        next(self._steps, lambda: None)()
+        return False
+
+
+@pytest.mark.parametrize(("seconds", "end"), [(10.0, 15.0), (20.0, 40.0)])
+def test_a_range_grows_with_the_session_only_if_it_reaches_its_end(tmp_path: Path, seconds: float, end: float) -> None:
+    clock = ManualClock(5.0)
+    recorder = SessionRecorder(tmp_path / "session.mcap", clock).open()
+    recorder.event("first")
+    clock.time = 25.0
+    recorder.attempt_end({"insertion": 0, "attempt": 0, "outcome": "inserted"})
+    with RecordedSession(recorder.path) as session, SessionPage([session], port=0) as page:
+
+        def add(time: float) -> None:
+            clock.time = time
+            recorder.attempt_end({"insertion": 0, "attempt": 1, "outcome": "inserted"})
+            session.refresh()
+
+        def finish() -> None:
+            clock.time = 40.0
+            recorder.event("last")
+            recorder.close()
+            session.refresh()
+
+        (panel,) = page._panels
+        panel.show_range(5.0, 5.0 + seconds)
+        panel.close()
+        # The session ends after a pass of the reader, which therefore takes another one.
+        panel._read(panel._curves, Steps(lambda: add(30.0), finish))
+        assert not session.growing and panel._curves.end == pytest.approx(end)

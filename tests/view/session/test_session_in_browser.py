@@ -1,4 +1,4 @@
-"""The page of sessions in a real browser, and the errors of its command."""
+"""The page of sessions in a real browser and without one, and the errors of its command."""
 
 import threading
 from collections.abc import Iterator
@@ -114,6 +114,33 @@ def test_two_sessions_side_by_side_can_be_aligned_at_an_attempt(paths: list[Path
         finally:
             ended.set()
             loop.join()
+
+
+def test_playing_stops_at_the_end_of_the_range(paths: list[Path]) -> None:
+    with RecordedSession(paths[0]) as session, SessionPage([session], port=0) as page:
+        for start in (6.99, 0.0, 7.5):  # the attempt lasts from 3 to 7 s
+            page._go(start)
+            page._show_range("this attempt")
+            page._toggle()
+            page._before -= 60.0  # as if the last update were long ago
+            page.update()
+            assert page.time == pytest.approx(7.0) and not page.playing
+            assert page._range == pytest.approx((3.0, 7.0))
+
+
+def test_two_aligned_sessions_are_shown_to_the_end_of_the_later_one(paths: list[Path]) -> None:
+    with (
+        RecordedSession(paths[1]) as first,
+        RecordedSession(paths[0]) as second,
+        SessionPage([first, second], port=0) as page,
+    ):
+        page._align("insertion 0, attempt 1")  # half a second earlier in the second session
+        page._go(100.0)
+        assert page._show_if_moved()
+        assert page.time == pytest.approx(12.4)
+        assert page._snapshots[1].time == pytest.approx(second.end)
+        page._align("starts of the recordings")
+        assert page.time == pytest.approx(11.9)
 
 
 def test_wrong_arguments_end_with_one_line(

@@ -5,6 +5,7 @@ import dataclasses
 import math
 import os
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from gelflow.cli.options import (
 from gelflow.cli.output import Output, progress_bar
 from gelflow.cli.session_replay import read_attempts
 from gelflow.errors import UsageError
-from gelflow.part import CUBOID
+from gelflow.part import CUBOID, Part
 from gelflow.policies.calibration.calibrated_scene import MODEL, SCENE, write_scene
 from gelflow.policies.calibration.calibration import Calibration, calibrate
 from gelflow.policies.calibration.fit import FitResult, FitSettings
@@ -44,6 +45,7 @@ from gelflow.real.runner.lab import Lab
 from gelflow.real.runner.lab_file import load_lab
 from gelflow.session.motion_plan import save_motion_plan
 from gelflow.session.records import readable_json
+from gelflow.sim.tasks.parts import load_part, part_names
 
 _QUICK = FitSettings(starts=2, members=48, nearby=32, poses=8, steps=1)
 
@@ -88,7 +90,11 @@ def run(args: argparse.Namespace) -> int:
         create_folder(args.plan.parent)
     if not args.sessions:
         recordings = _lab_recordings(args, lab)
-        output.result({"plan": _write_plan(args, lab, output, recordings, None)})
+        plan = _make_plan(args, lab, recordings, None)
+        try:
+            _write_plan(args, output, recordings, plan)
+        finally:  # the result is printed even where its file cannot be written
+            output.result({"plan": _plain_plan(plan)})
         return SUCCESS
     files = [args.out / "report.json", args.out / "report.html", args.out / SCENE, args.out / MODEL]
     for file in files:
@@ -110,20 +116,32 @@ def run(args: argparse.Namespace) -> int:
         )
     if not output.json:
         _show(output, result)
-    report = plain_report(result, args.sessions)
+    values = plain_report(result, args.sessions)
+    try:
+        _write_report(args, output, result, files, readable_json(values))
+        if args.plan is not None:
+            plan = _make_plan(args, lab, recordings, result.fit)
+            values["plan"] = _plain_plan(plan)
+            _write_plan(args, output, recordings, plan)
+    finally:  # the result is printed even where a file cannot be written
+        output.result(values)
+    return SUCCESS
+
+
+def _write_report(
+    args: argparse.Namespace, output: Output, result: Calibration, files: Sequence[Path], report: str
+) -> None:
+    """Write the new files: `report` as report.json, the page, and the scene. Raises UsageError if that fails."""
     try:
         with removed_on_error(*files):
-            _write_new(files[0], readable_json(report))
-            _write_new(files[1], page(result, args.sessions, recordings.task.grid))
+            _write_new(files[0], report)
+            _write_new(files[1], page(result, args.sessions, result.recordings.task.grid))
             scene = write_scene(result, args.out)
     except OSError as error:
         raise UsageError(f"cannot write the report to {args.out}: {error}") from error
     output.text(f"the report is {files[1]}")
     if scene:
         output.text(f"the scene with the known values is {scene[0]}")
-    plan = {} if args.plan is None else {"plan": _write_plan(args, lab, output, recordings, result.fit)}
-    output.result(report | plan)
-    return SUCCESS
 
 
 def _write_new(file: Path, text: str) -> None:
@@ -161,30 +179,40 @@ def _lab_recordings(args: argparse.Namespace, lab: Lab | None) -> Recordings:
     return nothing_recorded(task, grasp_force=lab.gripper.grasp_force, grasp_height=height, printed=printed)
 
 
-def _write_plan(
-    args: argparse.Namespace, lab: Lab | None, output: Output, recordings: Recordings, fitted: FitResult | None
-) -> list[dict[str, Any]]:
-    """Make, write and print a plan; returns its motions as plain data."""
+def _make_plan(args: argparse.Namespace, lab: Lab | None, recordings: Recordings, fitted: FitResult | None) -> Plan:
+    """The plan of --plan and --motions, with a progress bar."""
     stop = STOP_SHEAR_MM if lab is None else lab.descent.largest_stop_shear_mm
-    wanted = MOTIONS if args.motions is None else args.motions
     with progress_bar(count=True) as progress:
         bar = progress.add_task("planning", total=SCENARIOS)
-        plan = plan_motions(
+        return plan_motions(
             recordings,
             fitted=fitted,
-            count=wanted,
+            count=_wanted(args),
             workspace=_workspace(lab),
             stop_shear_mm=stop,
             seed=args.seed,
             progress=lambda done: progress.update(bar, completed=done),
         )
-    known = "what the sessions leave open" if args.sessions else "an unknown lab"
-    save_motion_plan(plan.motions, args.plan, title=f"Written by gelflow calibrate --plan for {known}.")
+
+
+def _write_plan(args: argparse.Namespace, output: Output, recordings: Recordings, plan: Plan) -> None:
+    """Print a plan, then write it. Raises UsageError when its file exists or cannot be written."""
     for line in _plan_lines(plan):
         output.text(line)
-    if len(plan.motions) < wanted:
+    if len(plan.motions) < (wanted := _wanted(args)):
         output.text(f"the workspace has {len(plan.motions)} motions to choose from, fewer than --motions {wanted}")
-    output.text(f"the plan is {args.plan}; record it with: {_run_command(args, recordings)}")
+    known = "what the sessions leave open" if args.sessions else "an unknown lab"
+    save_motion_plan(plan.motions, args.plan, title=f"Written by gelflow calibrate --plan for {known}.")
+    output.text(f"the plan is {args.plan}; record it with: {_run_command(args, recordings.task.part)}")
+
+
+def _wanted(args: argparse.Namespace) -> int:
+    """Number of motions of the plan."""
+    return MOTIONS if args.motions is None else int(args.motions)
+
+
+def _plain_plan(plan: Plan) -> list[dict[str, Any]]:
+    """The motions of a plan, with the gain of each, as plain data."""
     return [dataclasses.asdict(motion) | {"gain": gain} for motion, gain in zip(plan.motions, plan.gains, strict=True)]
 
 
@@ -193,13 +221,19 @@ def _workspace(lab: Lab | None) -> tuple[float, float, float] | None:
     return None if lab is None else (lab.workspace.x, lab.workspace.y, math.radians(lab.workspace.yaw_deg))
 
 
-def _run_command(args: argparse.Namespace, recordings: Recordings) -> str:
+def _run_command(args: argparse.Namespace, part: Part) -> str:
     """The command that records the plan on two parts, so that one of them can be held out."""
     words = ["gelflow", "run", "insertion", "--lab", "LAB" if args.lab is None else str(args.lab)]
-    part = recordings.task.part
-    if args.part is not None or part != CUBOID:
-        words += ["--part", part.name if args.part is None else args.part]
+    if args.part is not None:
+        words += ["--part", args.part]
+    elif part != CUBOID:
+        words += ["--part", part.name if _is_included(part) else "PART.toml"]
     return shlex.join([*words, "--plan", str(args.plan), "--insertions", "2"])
+
+
+def _is_included(part: Part) -> bool:
+    """Whether the name of a part loads the same part from gelflow; parts from a file have any name."""
+    return part.name in part_names() and load_part(part.name).part.to_json() == part.to_json()
 
 
 def _plan_lines(plan: Plan) -> list[str]:

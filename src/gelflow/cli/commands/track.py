@@ -18,6 +18,7 @@ from gelflow.cli.exit_codes import SUCCESS
 from gelflow.cli.output import Output, progress_bar
 from gelflow.errors import UsageError
 from gelflow.gel.gel_file import ElasticGel, load_gel
+from gelflow.geometry import rotated
 from gelflow.perception.camera_calibration import CameraCalibration, load_calibration
 from gelflow.perception.errors import TrackerInitError
 from gelflow.perception.force.image_forces import GridScale, ImageForces, grid_angle
@@ -187,7 +188,8 @@ def _track(
                         forces.reset()
             step = _tracked_image(number, frame, tracked, calibration, summary.pixels_per_mm)
             if forces is not None and step.displacement_mm is not None:
-                force = forces.estimate(step.displacement_mm, tracked.valid, frame.stamp)
+                moved = step.displacement_mm if calibration is None else rotated(step.displacement_mm, forces.angle)
+                force = forces.estimate(moved, tracked.valid, frame.stamp)
                 step = replace(step, force=force, slip=forces.slip)
             for writer in writers:
                 writer.add(step)
@@ -291,11 +293,12 @@ def _forces(
     if args.gel is None:
         return None
     if calibration is not None:
-        grid, angle = GridScale(calibration.spacing_mm, first.spacing / calibration.spacing_mm), 0.0
+        grid = GridScale(calibration.spacing_mm, first.spacing / calibration.spacing_mm)
     elif scale is not None:
-        grid, angle = GridScale(first.spacing / scale, scale), grid_angle(first.position, first.rows, first.cols)
+        grid = GridScale(first.spacing / scale, scale)
     else:
         raise UsageError("--gel needs millimetres: give --calibration, --pixels-per-mm or a --profile with a pitch")
+    angle = grid_angle(first.position, first.rows, first.cols)
     return ImageForces(args.gel, first.rows, first.cols, grid, angle)
 
 

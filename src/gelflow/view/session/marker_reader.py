@@ -1,5 +1,6 @@
 """Images of a session with their markers: tracked here, or as `gelflow track` has recorded them."""
 
+import contextlib
 import dataclasses
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import GelflowError, PeerError, UsageError
-from gelflow.perception.frames import CameraMount, decode_image, tactile_frame
+from gelflow.perception.frames import CameraMount, ImageDecoder, tactile_frame
 from gelflow.perception.tracker import MarkerTracker, TrackerConfig, TrackingResult
 from gelflow.session.records import SENSORS, described
 from gelflow.session.time_index import TimeIndex
@@ -43,6 +44,7 @@ class MarkerReader:
                 self._configs = described(TrackerConfig, description, "trackers", what="tracker settings")
         except UsageError as error:
             self.problem = str(error)
+        self._decoders: dict[int, ImageDecoder] = {}
         self._trackers: dict[int, MarkerTracker | str] = {}
         self._tried: dict[int, float] = {}  # duration of the session when a tracker was started last [s]
         self._references: OrderedDict[tuple[int, float], TrackingResult] = OrderedDict()
@@ -54,7 +56,7 @@ class MarkerReader:
         if record is None:
             return None
         try:
-            pixels = decode_image(record.value.data)
+            pixels = self._decode(sensor, record.value.data)
         except GelflowError as error:
             return PadImage(np.zeros((480, 640, 3), dtype=np.uint8), record.stamp, problem=str(error))
         if not track:
@@ -89,6 +91,16 @@ class MarkerReader:
         along = frame.shear[0, frame.valid[0], 0]
         return float(along.mean()) if len(along) and frame.unit == "mm" else float("nan")
 
+    def _decode(self, sensor: int, data: bytes) -> NDArray[np.uint8]:
+        """The decoded image of a pad. The first one of the session determines the bit depth, as in `gelflow track`."""
+        if sensor not in self._decoders:
+            decoder = self._decoders[sensor] = ImageDecoder()
+            first = self._index.first(f"/{SENSORS[sensor]}/image", self._index.start)
+            if first is not None:
+                with contextlib.suppress(GelflowError):
+                    decoder(first.value.data)
+        return self._decoders[sensor](data)
+
     def _track(self, sensor: int, pixels: NDArray[np.uint8], time: float) -> TrackingResult | None:
         topic = f"/{SENSORS[sensor]}/markers"
         if topic in self._recorded:
@@ -113,7 +125,7 @@ class MarkerReader:
             image = self._index.latest(topic, time) or self._index.first(topic, time)
             if image is None:
                 raise PeerError("no reference image")
-            self._references[key] = self._tracker(sensor).track(decode_image(image.value.data))
+            self._references[key] = self._tracker(sensor).track(self._decode(sensor, image.value.data))
             if len(self._references) > _REFERENCES:
                 self._references.popitem(last=False)
         self._references.move_to_end(key)
@@ -141,7 +153,7 @@ class MarkerReader:
                 continue
             tracker = MarkerTracker(self._configs[sensor])
             try:
-                tracker.start(decode_image(image.value.data))
+                tracker.start(self._decode(sensor, image.value.data))
             except GelflowError as error:
                 problem = str(error)
                 continue

@@ -49,6 +49,7 @@ class RecordedSession:
             self.reader.close()
             raise
         self.name = self.reader.path.name
+        self.growing = self._live is not None and not self._live.finished  # it is still being recorded
         self.start = self.index.start  # robot time [s]
         if "task" not in self.description:  # of `gelflow track`, whose description has no time
             self.start = min((record.time for record in self._first_images()), default=self.start)
@@ -88,11 +89,6 @@ class RecordedSession:
         found = [self.index.first(topic, self.index.start) for topic in topics]
         return [record for record in found if record is not None]
 
-    @property
-    def growing(self) -> bool:
-        """Whether the session is still being recorded."""
-        return self._live is not None and not self._live.finished
-
     def refresh(self) -> bool:
         """Add what has been recorded since the last call; whether there was anything. Only for live sessions."""
         if self._live is None:
@@ -107,6 +103,7 @@ class RecordedSession:
             added += [self._live.record(topic, message) for topic, message in messages]
         if added:
             self._add(added)
+        self.growing = not self._live.finished  # after the last records are added, for other threads
         return bool(found)
 
     def _add(self, records: list[Record]) -> None:

@@ -68,7 +68,8 @@ class SessionPage:
         self._snapshots: list[Snapshot] = []
         same = len({session.name for session in sessions}) < len(sessions)
         self._names = [f"{s.reader.path.parent.name}/{s.name}" if same else s.name for s in sessions]
-        self._duration = max(session.end - session.start for session in sessions)
+        self._sessions = sessions
+        self._duration = self._longest()
         self._range = (0.0, self._duration)
         self._first_view = sessions[0].first_view - sessions[0].start
         self._live = any(session.growing for session in sessions)
@@ -125,7 +126,7 @@ class SessionPage:
         self._grow()
         changed = self._handle_events()
         if self.playing:
-            self._go(self.time + self._speed * (now - self._before), moved=True)
+            self._go(min(self.time + self._speed * (now - self._before), self._range[1]), moved=True)
         elif not changed or self._live:
             self._settle()
         self._before = now
@@ -154,13 +155,18 @@ class SessionPage:
             self._next_follow = now + min(max(_FOLLOW_PERIOD, pause), _LONGEST_PAUSE)
 
     def _extend(self) -> None:
-        """Extend the timeline to the present end."""
-        whole = self._range == (0.0, self._duration)
-        self._duration = max(panel.session.end - panel.session.start for panel in self._panels)
-        if whole:
-            self._range = (0.0, self._duration)
-            self._slider.max = max(round(self._duration, 2), _SLIDER_STEP)
+        """Extend the timeline to the present end, unless it shows an earlier range."""
+        at_end = self._range[1] == self._duration
+        self._duration = self._longest()
+        if at_end:
+            start = self._range[0]
+            self._range = (start, self._duration)
+            self._slider.max = max(round(self._duration, 2), round(start, 2) + _SLIDER_STEP)
         self._refresh_marks()
+
+    def _longest(self) -> float:
+        """Time of the page at which the last session ends [s]."""
+        return max(s.end - s.start - offset for s, offset in zip(self._sessions, self._offsets, strict=True))
 
     def _add_panel(
         self, session: RecordedSession, comparisons: Sequence[Comparison] | None, number: int, folder: Any
@@ -249,7 +255,7 @@ class SessionPage:
 
     def _toggle(self) -> None:
         self._following = False
-        if not self.playing and self.time >= self._range[1]:
+        if not self.playing and not self._range[0] <= self.time < self._range[1]:
             self.time = self._range[0]
         self._set_playing(not self.playing)
 
@@ -325,8 +331,10 @@ class SessionPage:
         first, second = (_attempt_starts(panel) for panel in self._panels)
         offset = next((second[key] - first[key] for key in first if _attempt_name(key) == name and key in second), 0.0)
         self._offsets[1] = offset
+        self._duration = self._longest()
         self._shown = None
         self._show_range(_RANGES[0])
+        self._go(self.time)
 
 
 def _attempt_starts(panel: SessionPanel) -> dict[tuple[int | None, int | None], float]:

@@ -24,6 +24,7 @@ _DECISION_PICTURES = 32  # that are kept
 _GROWTH = 1.0  # period in which curves of a growing session are extended [s]
 _GROWTH_SAMPLES = 4  # of the curves of a growing session, in a second of robot time
 _DRAWING_SHARE = 4  # pause after drawing, in durations of drawing
+_SAME_TIME = 1e-6  # difference of times that is rounding [s]
 _REDRAW = 5  # rounds of samples between two pictures of the curves
 
 
@@ -77,6 +78,7 @@ class SessionPanel:
         self._drawn: Timeline | None = None
         self._time = session.start
         self._curves = Curves(session.start, session.end)
+        self._grows = True  # the shown range grows with the session
         self._reading = threading.Event()
         self._reader: threading.Thread | None = None
 
@@ -86,8 +88,12 @@ class SessionPanel:
         return sorted([*self.session.timeline_events, *self._differences()], key=lambda event: event.time)
 
     def show_range(self, start: float, end: float) -> None:
-        """Read and draw the curves from `start` to `end` [s] in the background."""
+        """Read and draw the curves from `start` to `end` [s] in the background.
+
+        A range that reaches the end of the session grows with it.
+        """
         self.close()
+        self._grows = end > self.session.end - _SAME_TIME
         self._curves = curves = Curves(max(start, self.session.start), min(end, self.session.end))
         self._reading = threading.Event()
         self._reader = threading.Thread(target=self._read, args=(curves, self._reading), name="curves", daemon=True)
@@ -127,7 +133,8 @@ class SessionPanel:
     def show_end(self) -> None:
         """Show the end of a recording that has grown, with the curves as far as they are read."""
         self.close()
-        self._curves.end = self.session.end
+        if self._grows:
+            self._curves.end = self.session.end
         self._draw(self._curves)
         self.refresh()
 
@@ -161,17 +168,19 @@ class SessionPanel:
 
     def _read(self, curves: Curves, ended: threading.Event) -> None:
         """In a thread: read the curves, and draw them from time to time; of a growing session also what is added."""
-        samples = _growth_samples(curves) if self.session.growing else SAMPLES
+        growing = self.session.growing
+        samples = _growth_samples(curves) if growing else SAMPLES
         for number, _ in enumerate(read_curves(self.session, curves, samples=samples)):
             if ended.is_set():
                 return
             if number % _REDRAW == 0:
                 self._draw(curves)
         self._draw(curves)
-        while self.session.growing and not ended.wait(_GROWTH):
+        while growing and not ended.wait(_GROWTH):
+            growing = self.session.growing  # before the end is read: the last pass adds the last records
             begun = perf_counter()
             added = Curves(curves.end, self.session.end)
-            if added.end > added.start:
+            if self._grows and added.end > added.start:
                 # On a busy machine the curves are coarser instead of late: the first samples are spread evenly too.
                 for _ in read_curves(self.session, added, samples=_growth_samples(added)):
                     if ended.is_set() or perf_counter() - begun > _GROWTH:

@@ -73,6 +73,8 @@ def train_task(args: argparse.Namespace) -> int:
             report=report,
         )
     shares = ", ".join(f"{name} {share:.0%}" for name, share in result.shares.items())
+    if result.stored:
+        output.text(f"{folder} holds this training already, finished; its result:")
     output.text(f"best on validation: {_line(result.best)}")
     output.text(f"{result.steps:,} steps in {result.minutes:.1f} min: {shares}")
     output.text(f"checkpoint {result.checkpoint}, progress and learning curve in {folder}")

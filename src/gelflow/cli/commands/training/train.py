@@ -85,6 +85,8 @@ def run(args: argparse.Namespace) -> int:
     with progress_bar(TaskProgressColumn(), TimeElapsedColumn()) as progress:
         made = _train(args, progress)
     best = made.best
+    if made.stored:
+        output.text(f"{args.out} holds this training already, finished; its result:")
     output.text(f"best on validation: {_inserted(best)}")
     seconds = {name: made.seconds[name] for name in ("simulation", "learning")}
     total = sum(seconds.values())

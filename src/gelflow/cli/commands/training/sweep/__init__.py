@@ -1,7 +1,7 @@
 """`gelflow sweep GRID`: many training runs on one or many machines."""
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
@@ -141,28 +141,47 @@ class _SweepProgress:
 
 
 def _finish(grid: "Grid", runs: Sequence["Run"], folder: Path, output: Output) -> int:
-    """Write the tables and the picture, and print the results."""
-    from gelflow.policies.sweep import curves, results
+    """Write the tables and the picture, and print the results, also where a file cannot be written."""
+    from gelflow.policies.sweep import results
     from gelflow.policies.sweep.run import read_record
 
     records = {run.name: read_record(run) for run in runs}
     rows, found = results.rows(runs, records), results.configurations(runs, records)
-    files = {"runs": folder / "runs.csv", "summary": folder / "summary.csv"}
-    results.write_csv(files["runs"], rows)
-    results.write_csv(files["summary"], results.summary_rows(found))
-    drawn = curves.read_curves(runs, records, grid.curve)
-    if drawn:
-        files |= {"curves": folder / "curves.csv", "picture": folder / "curves.png"}
-        results.write_csv(files["curves"], drawn.rows())
-        curves.draw(files["picture"], drawn, grid.task)
+    files: dict[str, Path] = {}
+    failure: Exception | None = None
+    try:
+        for name, table in (("runs", rows), ("summary", results.summary_rows(found))):
+            results.write_csv(folder / f"{name}.csv", table)
+            files[name] = folder / f"{name}.csv"
+        files |= _write_curves(grid, runs, records, folder)
+    except (OSError, UsageError) as error:
+        failure = error
     failed = [run for run in runs if records[run.name].state != "complete"]
     output.console.print(summary_table(found, output.console))
     for run in failed:
         log = f" (log: {run.log})" if run.log.exists() else ""
         output.text(f"failed: {run.name}: {records[run.name].error}{log}")
-    output.text(f"written: {', '.join(str(path) for path in files.values())}")
+    if files:
+        output.text(f"written: {', '.join(str(path) for path in files.values())}")
     output.result(
         {"folder": folder, "complete": len(runs) - len(failed), "failed": len(failed)}
         | {"runs": rows, "configurations": found, "files": files}
     )
+    if failure is not None:
+        raise failure
     return NEGATIVE_RESULT if failed else SUCCESS
+
+
+def _write_curves(
+    grid: "Grid", runs: Sequence["Run"], records: Mapping[str, "RunRecord"], folder: Path
+) -> dict[str, Path]:
+    """Write the learning curves, if there are any, as a table and as a picture; the files."""
+    from gelflow.policies.sweep import curves, results
+
+    drawn = curves.read_curves(runs, records, grid.curve)
+    if drawn is None:
+        return {}
+    files = {"curves": folder / "curves.csv", "picture": folder / "curves.png"}
+    results.write_csv(files["curves"], drawn.rows())
+    curves.draw(files["picture"], drawn, grid.task)
+    return files

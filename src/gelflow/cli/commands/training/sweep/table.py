@@ -8,6 +8,8 @@ from rich.console import Console
 from rich.measure import Measurement
 from rich.table import Table
 
+from gelflow.policies.sweep.results import option_columns
+
 if TYPE_CHECKING:
     from gelflow.policies.sweep.results import Configuration, Range
 
@@ -31,8 +33,7 @@ def _table(found: Sequence["Configuration"], names: Sequence[str]) -> Table:
     """The table with the results `names`."""
     title = "median (smallest to largest) over the seeds"
     view = Table(title=title if names else None, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    options = list(found[0].values)
-    for option in options:
+    for option in option_columns(found[0].values):
         view.add_column(option, overflow="ellipsis", no_wrap=True)
     view.add_column("complete", justify="right", no_wrap=True)
     last_parts = [name.split(".")[-1] for name in names]
@@ -41,7 +42,7 @@ def _table(found: Sequence["Configuration"], names: Sequence[str]) -> Table:
     for configuration in found:
         cells = [_range(configuration.results.get(name)) for name in names]
         complete = f"{configuration.complete} of {configuration.runs}"
-        view.add_row(*(str(configuration.values[option]) for option in options), complete, *cells)
+        view.add_row(*map(str, configuration.values.values()), complete, *cells)
     return view
 
 
