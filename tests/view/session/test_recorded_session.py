@@ -48,7 +48,7 @@ def session(path: Path) -> Iterator[RecordedSession]:
         yield opened
 
 
-def test_marks_are_the_attempts_decisions_and_warnings(session: RecordedSession) -> None:
+def test_events_are_the_attempts_decisions_warnings_and_stops(session: RecordedSession) -> None:
     found = [
         (m.kind, round(m.time - session.start, 2), round(m.end - session.start, 2)) for m in session.timeline_events
     ]
