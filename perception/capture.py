@@ -67,17 +67,16 @@ class Capture:
         capture = self._open()
         rate = capture.get(cv2.CAP_PROP_FPS)
         rate = rate if 0.1 <= rate <= 1000 else self.rate
-        expected, number, seconds = capture.get(cv2.CAP_PROP_FRAME_COUNT), 0, 0.0
-        stamps = _VideoStamps(rate)
+        expected, stamps = capture.get(cv2.CAP_PROP_FRAME_COUNT), _VideoStamps(rate)
         try:
             while (image := _read(capture)) is not None:
-                stated = capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3
-                seconds = max(seconds, stated)
-                yield CapturedImage(image, stamps.next(stated))
-                number += 1
+                yield CapturedImage(image, stamps.next(capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3))
         finally:
             capture.release()
-        missing = expected - max(number, seconds * rate + 1)  # by time too: a container may only estimate the number
+        number = stamps.number
+        missing = expected - max(
+            number, stamps.latest * rate + 1
+        )  # by time too: a container may only estimate the number
         if number and missing > max(_MISSING, _MISSING_SHARE * expected):
             raise PeerError(
                 f"video {self.text} ends after {number} of {expected:.0f} images: it is truncated or damaged"
@@ -191,24 +190,24 @@ class _VideoStamps:
     """
 
     rate: float  # [Hz]
-    _number: int = 0  # of the next image
+    number: int = 0  # of images so far
+    latest: float = 0.0  # latest time in the container [s]
     _first: float = 0.0  # time of the first image in the container [s]
-    _latest: float = 0.0  # latest time in the container [s]
     _uneven: bool = False
     _stamp: float = 0.0  # of the last image
 
     def next(self, stated: float) -> float:
         """The stamp of the next image, whose time in the container is `stated`."""
-        if self._number == 0:
-            self._first = self._latest = stated
-        even, own = self._number / self.rate, stated - self._first
+        if self.number == 0:
+            self._first = self.latest = stated
+        even, own = self.number / self.rate, stated - self._first
         # Some containers round times to milliseconds.
-        self._uneven |= stated > self._latest and abs(own - even) > _ROUNDING
-        self._latest = max(self._latest, stated)
+        self._uneven |= stated > self.latest and abs(own - even) > _ROUNDING
+        self.latest = max(self.latest, stated)
         stamp = own if self._uneven else even
-        if self._number:  # several images may have the same millisecond
+        if self.number:  # several images may have the same millisecond
             stamp = max(stamp, self._stamp + _SMALLEST_STEP / self.rate)
-        self._number += 1
+        self.number += 1
         self._stamp = stamp
         return stamp
 

@@ -251,8 +251,9 @@ def _is_image(path: Path) -> bool:
 
 
 def _check_pages(file: Path) -> None:
-    """Raise UsageError for a TIFF file with several pages, of which OpenCV would read the first only, and for one whose
-    name is not UTF-8.
+    """Raise UsageError for a TIFF file with several pages, or with a name that is not UTF-8.
+
+    OpenCV would read the first page only.
     """
     if file.suffix.lower() in (".tif", ".tiff") and (pages := cv2.imcount(name_for_opencv(file))) > 1:
         raise UsageError(f"{file} has {pages} pages; split it into a folder of images")

@@ -209,14 +209,11 @@ class MockMjpegCamera:
     def _next(self, client: "_Client") -> list[bytes] | None:
         """The parts for a client, which wait for a new image or for the time of a delayed part; None at the end."""
 
-        def ended() -> bool:
-            return self._closing or self._failure is not None or self._epoch != client.epoch
-
         def new_image() -> bool:
             return self._number > client.number and not self._silent
 
         with self._changed:
-            while not ended():
+            while not self._ended(client.epoch):
                 now = self._clock.now()
                 if new_image():
                     corruption = self._corrupt.pop(0) if self._corrupt else None
@@ -225,19 +222,21 @@ class MockMjpegCamera:
                 if parts := client.stream.take(now):
                     return parts
                 left = self._clock.wall(client.stream.next_due - now)
-                self._changed.wait_for(lambda: ended() or new_image(), None if math.isinf(left) else left)
+                self._changed.wait_for(
+                    lambda: self._ended(client.epoch) or new_image(), None if math.isinf(left) else left
+                )
             return None
 
     def _snapshot(self) -> bytes | None:
         """The next image; None at the end."""
-
-        def ended() -> bool:
-            return self._closing or self._failure is not None or self._epoch != epoch
-
         with self._changed:
             before, epoch = self._number, self._epoch
-            self._changed.wait_for(lambda: ended() or self._number > before)
+            self._changed.wait_for(lambda: self._ended(epoch) or self._number > before)
             return self._image if self._number > before else None
+
+    def _ended(self, epoch: int) -> bool:
+        """Whether a client that came in this epoch gets no more images."""
+        return self._closing or self._failure is not None or self._epoch != epoch
 
     @contextlib.contextmanager
     def _client(self) -> Iterator["_Client"]:

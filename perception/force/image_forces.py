@@ -18,10 +18,11 @@ _NOISE_PX = 0.05  # of a tracked displacement along one axis
 
 @dataclass(frozen=True)
 class GridScale:
-    """The scale of a tracked grid."""
+    """The scale of a tracked grid, and the axes of its displacements in millimetres."""
 
     pitch_mm: float
     pixels_per_mm: float  # mean
+    along_grid: bool = False  # displacements are along rows and columns, as with a calibration, not along the image
 
 
 def grid_angle(rest: NDArray[np.float64], rows: int, cols: int) -> float:
@@ -43,6 +44,7 @@ class ImageForces:
         noise = _NOISE_PX / scale.pixels_per_mm * 1e-3
         grid = Grid(rows, cols, scale.pitch_mm)
         self.angle = angle
+        self._along_grid = scale.along_grid
         self._modulus_deviation = gel.youngs_modulus_deviation
         self._estimator = ForceEstimator(gel, grid, noise=noise)
         self._slip = SlipEstimator(grid, friction=gel.friction or None, friction_deviation=gel.friction_deviation)
@@ -57,12 +59,13 @@ class ImageForces:
     def estimate(
         self, displacement_mm: NDArray[np.float64], valid: NDArray[np.bool_], stamp: float
     ) -> ForceEstimate | None:
-        """Forces (right, down) at `stamp` [s] for displacements (right, down) [mm], shape (markers, 2).
+        """Forces (right, down) in the axes of the image, at `stamp` [s].
 
-        Both are in the axes of the image: rotate displacements of a calibration, which are along rows and columns, by
-        `angle` first. None if fewer than half of the markers are valid.
+        The displacements (right, down) [mm], shape (markers, 2), are in the axes that `GridScale.along_grid` states.
+        None if fewer than half of the markers are valid.
         """
-        displacement = rotated(displacement_mm, -self.angle)[:, ::-1] * 1e-3
+        along = displacement_mm if self._along_grid else rotated(displacement_mm, -self.angle)
+        displacement = along[:, ::-1] * 1e-3
         estimate = self._estimator.estimate(displacement, valid, stamp)
         self.slip = self._slip.estimate(estimate, displacement, valid, stamp)
         return None if estimate is None else _in_image(estimate, self.angle, self._modulus_deviation)

@@ -24,7 +24,7 @@ from gelflow.sim.tasks.task_batch import TaskBatch
 
 RESULTS, EPISODES, FAILURES, FAILURE_PICTURE = "results.json", "episodes.csv", "failures.csv", "failures.png"
 _FILMS = ("success.gif", "success.png", "failure.gif", "failure.png")
-_FILES = (RESULTS, EPISODES, FAILURES, FAILURE_PICTURE, *_FILMS)
+_OTHER_FILES = (EPISODES, FAILURES, FAILURE_PICTURE, *_FILMS)
 FORMAT = 1  # of results.json
 _MAX_FRAMES = 200  # of a film
 _LAST_FRAME = 2000  # [ms]
@@ -134,7 +134,7 @@ def has_oracle(task: TaskBatch) -> bool:
 
 def _check_replaceable(out: Path) -> None:
     """Raises UsageError when the folder has a file of a report, but not the results of an evaluation."""
-    present = [name for name in _FILES if (out / name).exists()]
+    present = [name for name in (RESULTS, *_OTHER_FILES) if (out / name).exists()]
     if not present:
         return
     try:
@@ -155,9 +155,8 @@ def _write_results(out: Path, report: Report) -> None:
 
 def _remove_files(out: Path) -> None:
     """Removes the other files of an earlier report; the new one need not have a failure, or a success."""
-    for name in _FILES:
-        if name != RESULTS:
-            (out / name).unlink(missing_ok=True)
+    for name in _OTHER_FILES:
+        (out / name).unlink(missing_ok=True)
 
 
 def _write_tables(out: Path, episodes: Episodes, report: Report) -> None:

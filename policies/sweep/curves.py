@@ -46,9 +46,9 @@ class Curves:
     def rows(self) -> list[Row]:
         """One flat table row per point."""
         return [
-            {**options, self.x_name: x, "median": median, "smallest": low, "largest": high, "seeds": c.seeds}
+            option_columns(c.values)
+            | {self.x_name: x, "median": median, "smallest": low, "largest": high, "seeds": c.seeds}
             for c in self.curves
-            for options in [option_columns(c.values)]
             for x, median, low, high in zip(
                 c.x.tolist(), c.median.tolist(), c.low.tolist(), c.high.tolist(), strict=True
             )

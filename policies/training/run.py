@@ -217,7 +217,7 @@ class TrainingRun:
         elif (self.folder / PROGRESS).exists():
             raise UsageError(f"{self.folder / PROGRESS} is not of a run; choose another folder or delete it")
         else:
-            self._write_configuration(self._configuration(), finished=False)
+            self._write_configuration()
         if (self.folder / STATE).exists():
             state = load_state(self.folder / STATE)
             self.learner.load(state)
@@ -246,15 +246,14 @@ class TrainingRun:
         }
         save_state(self.folder / STATE, state)
 
-    def _write_configuration(
-        self, configuration: Mapping[str, Any], *, finished: bool, result: Mapping[str, Any] | None = None
-    ) -> None:
+    def _write_configuration(self, *, result: Mapping[str, Any] | None = None) -> None:
+        """Writes the configuration; with the result of the run, which is then finished."""
         versions = {"gelflow": __version__, "python": platform.python_version()}
         versions |= {"numpy": np.__version__, "torch": str(torch.__version__)}
-        values = {"format": FORMAT, "finished": finished, "command": list(self.command), "versions": versions}
+        values = {"format": FORMAT, "finished": result is not None, "command": list(self.command), "versions": versions}
         if result is not None:
             values["result"] = result
-        text = readable_json({**values, "configuration": configuration})
+        text = readable_json({**values, "configuration": self._configuration()})
         replace_file(self.folder / CONFIGURATION, text.encode())
 
     def _finish(self, start: float) -> TrainingResult:
@@ -263,7 +262,7 @@ class TrainingRun:
         progress_curve.draw(self.folder / PICTURE, self.folder / PROGRESS, title=self.learner.task.description.name)
         numbers: dict[str, Any] = {"steps": self.learner.steps, "minutes": self._minutes(start)}
         numbers["seconds"] = dict(self.learner.clock.seconds)
-        self._write_configuration(self._configuration(), finished=True, result={"best": vars(self._best), **numbers})
+        self._write_configuration(result={"best": vars(self._best), **numbers})
         (self.folder / STATE).unlink(missing_ok=True)
         return TrainingResult(self.folder, self._best, checkpoint=self.checkpoint, **numbers)
 

@@ -180,9 +180,9 @@ class MotionExecutor:
     def move(self, target: Pose, *, speed: float | None = None) -> None:
         """Move to `target` and wait for the arrival. Raises PeerTimeout when the arm comes no closer for 3 s."""
         self.start_motion(target, speed=speed)
-        progress = self.approach_monitor(target)
+        approach = self.approach_monitor(target)
         while not self.arrived():
-            progress.check()
+            approach.check()
             self.wait(0.02)
 
     def approach_monitor(self, target: Pose) -> ApproachMonitor:

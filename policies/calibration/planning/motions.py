@@ -77,11 +77,11 @@ def plan_motions(
     task, rng = recordings.task, np.random.default_rng((seed, 0x9A2))
     poses = candidates(task, workspace)
     noise = recordings.noise() / readings.scale if len(recordings) else USUAL_NOISE
-    drift = DRIFT if fitted is None else fitted.best.drift
+    drift, joint = (DRIFT, None) if fitted is None else (fitted.best.drift, fitted.joint_distribution)
     per_newton = displacement_scale(readings.forces.scene)
     found = []
     for k in range(scenarios):
-        point = _point(len(readings.fitted), fitted, rng)
+        point = _point(len(readings.fitted), joint, rng)
         misalignment = task.draw_misalignment(rng, 1)[0]
         with contextlib.suppress(SimulationError):  # a gripper that cannot hold the part
             depths, shear = _stops(readings, point, in_hole(misalignment, poses), stop_shear_mm / per_newton)
@@ -91,9 +91,7 @@ def plan_motions(
         progress(k + 1)
     if not found:
         raise SimulationError("no plan: the attempts cannot be simulated with the parameters of any scenario")
-    before: Array = np.eye(len(readings.fitted))
-    if fitted is not None:
-        before = np.asarray(np.linalg.inv(fitted.joint_distribution[1]))
+    before: Array = np.eye(len(readings.fitted)) if joint is None else np.asarray(np.linalg.inv(joint[1]))
     chosen, gains, after = _greedy(np.stack(found), before, pose_prior(task), count)
     motions = tuple(PlannedMotion(x, y, yaw, task.descent, stop_shear_mm) for x, y, yaw in poses[chosen].tolist())
     names = [p.name for p in readings.fitted]
@@ -119,12 +117,12 @@ def candidates(task: InsertionTask, workspace: tuple[float, float, float] | None
     return inside
 
 
-def _point(count: int, fitted: FitResult | None, rng: np.random.Generator) -> Array:
-    """Whitened parameters of a scenario: of the prior, or of the joint distribution of a fit within its limits."""
+def _point(count: int, joint: tuple[Array, Array] | None, rng: np.random.Generator) -> Array:
+    """Whitened parameters of a scenario: of the prior, or of the joint distribution of a fit, see `FitResult`."""
     drawn = np.clip(rng.normal(size=count), -1.7, 1.7)
-    if fitted is None:
+    if joint is None:
         return _SPREAD * drawn
-    mean, covariance = fitted.joint_distribution
+    mean, covariance = joint
     return np.asarray(np.clip(mean + np.linalg.cholesky(covariance) @ drawn, -FARTHEST, FARTHEST))
 
 

@@ -122,7 +122,7 @@ class GuardedMotion:
         # A mock robot's time waits for this loop: on a busy computer the arm would travel on before an image is seen.
         with self._clock.bounded(RUNNER) as renew:
             self._motion.start_motion(target, speed=speed, guarded=True)
-            progress = self._motion.approach_monitor(target)
+            approach = self._motion.approach_monitor(target)
             while not self._motion.arrived(within=within):
                 renew()
                 self._motion.wait(0.0)
@@ -137,10 +137,10 @@ class GuardedMotion:
                     self._motion.hold()
                     self._wait_until_readable()
                     self._motion.start_motion(target, speed=speed, guarded=True)
-                    progress = self._motion.approach_monitor(target)
+                    approach = self._motion.approach_monitor(target)
                 elif not self._motion.report_observation(self.observer.unreadable_time()):  # this thread was delayed
                     self._motion.start_motion(target, speed=speed, guarded=True)
-                progress.check()
+                approach.check()
                 self._check_deadline(deadline)
         return None
 

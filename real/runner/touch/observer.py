@@ -75,7 +75,7 @@ class TactileObserver:
         self._results: list[TrackingResult] = []
         self._readable: list[bool] = []
         self._on_result = on_result
-        self._unpublished: list[int] = []  # sensors whose newest result is readable and was not passed on
+        self._unpublished: list[int] = []  # sensors whose newest result is readable and was not published
         self._readable_stamps: list[float] = []  # of the newest readable image of each sensor [s]
         self._intervals: deque[float] = deque(maxlen=_PERIODS)
         self.tracked: list[list[int]] = [[] for _ in cameras]  # sequence numbers given to each tracker, in order

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from gelflow.errors import GelflowError
 from gelflow.gel.gel_file import ElasticGel
-from gelflow.geometry import rotated
 from gelflow.helper_process import HelperProcess
 from gelflow.perception.force.image_forces import GridScale, grid_angle
 from gelflow.perception.frames import CameraMount
@@ -176,19 +175,15 @@ def pad_forces(lab: Lab, recorder: SessionRecorder) -> Iterator[PadForces | None
 
 def _scale(mount: CameraMount) -> GridScale:
     if mount.calibration is not None:
-        return GridScale(mount.pitch, float(np.mean(mount.calibration.pixels_per_mm())))
+        return GridScale(mount.pitch, float(np.mean(mount.calibration.pixels_per_mm())), along_grid=True)
     assert mount.pixels_per_mm is not None, "the lab file states a scale"
     return GridScale(mount.pitch, mount.pixels_per_mm)
 
 
 def _request(tracked: _Tracked, mount: CameraMount) -> dict[str, Any]:
-    """A request: displacements (right, down) [mm] from the unloaded pad, in the axes of the image, shape (markers, 2),
-    and validity.
-    """
+    """A request: displacements (right, down) [mm] from the unloaded pad, shape (markers, 2), and validity."""
     displacement = tracked.result.position - tracked.rest.position
     moved = mount.displacement_mm(replace(tracked.result, displacement=displacement))
-    if mount.calibration is not None:  # along rows and columns of the grid
-        moved = rotated(moved, grid_angle(tracked.rest.position, *mount.image_grid))
     valid = tracked.result.valid & tracked.rest.valid
     return {
         "stamp": tracked.image.stamp,

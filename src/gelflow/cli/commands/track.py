@@ -18,7 +18,6 @@ from gelflow.cli.exit_codes import SUCCESS
 from gelflow.cli.output import Output, progress_bar
 from gelflow.errors import UsageError
 from gelflow.gel.gel_file import ElasticGel, load_gel
-from gelflow.geometry import rotated
 from gelflow.perception.camera_calibration import CameraCalibration, load_calibration
 from gelflow.perception.errors import TrackerInitError
 from gelflow.perception.force.image_forces import GridScale, ImageForces, grid_angle
@@ -188,8 +187,7 @@ def _track(
                         forces.reset()
             step = _tracked_image(number, frame, tracked, calibration, summary.pixels_per_mm)
             if forces is not None and step.displacement_mm is not None:
-                moved = step.displacement_mm if calibration is None else rotated(step.displacement_mm, forces.angle)
-                force = forces.estimate(moved, tracked.valid, frame.stamp)
+                force = forces.estimate(step.displacement_mm, tracked.valid, frame.stamp)
                 step = replace(step, force=force, slip=forces.slip)
             for writer in writers:
                 writer.add(step)
@@ -293,7 +291,7 @@ def _forces(
     if args.gel is None:
         return None
     if calibration is not None:
-        grid = GridScale(calibration.spacing_mm, first.spacing / calibration.spacing_mm)
+        grid = GridScale(calibration.spacing_mm, first.spacing / calibration.spacing_mm, along_grid=True)
     elif scale is not None:
         grid = GridScale(first.spacing / scale, scale)
     else:
