@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from benchmarks import script
 
-from gelflow.cli.mock_process import mock_robot
 from gelflow.errors import GelflowError
+from gelflow.mock_lab.robot_process import mock_robot
 from gelflow.policies.calibration.calibration import calibrate
 from gelflow.policies.calibration.experiment.coverage import counted, coverage_table, outcome
 from gelflow.policies.calibration.experiment.worlds import widened

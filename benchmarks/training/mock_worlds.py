@@ -19,9 +19,9 @@ from typing import Any
 from benchmarks import script
 from rich.table import Table
 
-from gelflow.cli.mock_process import mock_robot, true_state
 from gelflow.cli.options import checkpoint_for, part_task
 from gelflow.errors import GelflowError
+from gelflow.mock_lab.robot_process import mock_robot, true_state
 from gelflow.policies.checkpoint import load_policy
 from gelflow.real.runner.insertion.attempt import Insertion
 from gelflow.real.runner.lab_file import load_lab

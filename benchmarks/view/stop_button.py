@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 from tests.view.browser import Browser, browser
 
-from gelflow.cli.mock_lab import lab_for
 from gelflow.errors import SafetyError
 from gelflow.hardware_mocks.robot import MockRobot, MockRobotConfig
+from gelflow.mock_lab.lab import lab_for
 from gelflow.policies.checkpoint import default_checkpoint, load_policy
 from gelflow.real.egm.codec import decode_sensor
 from gelflow.real.runner.motion_executor import MotionExecutor

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from markdown_table import markdown_table
 
-from gelflow.cli.promises.table import PROMISES
 from gelflow.gymnasium_registration import ENVIRONMENTS
+from gelflow.mock_lab.promises.table import PROMISES
 from gelflow.real.runner.phases import PHASES
 from gelflow.sim.scene import load_scene
 from gelflow.sim.tasks.randomization import Distribution

@@ -12,11 +12,11 @@ import pytest
 from tests.real.runner.harness import FACTOR, OraclePolicy, free_port, plan_for
 
 from gelflow.cli.main import main
-from gelflow.cli.mock_lab import lab_for
 from gelflow.errors import SafetyError
 from gelflow.hardware_mocks.robot import MockRobot, MockRobotConfig
 from gelflow.hardware_mocks.simulated_cell.cell import SimulatedCellConfig
 from gelflow.hardware_mocks.simulated_cell.world import CameraView, World
+from gelflow.mock_lab.lab import lab_for
 from gelflow.perception import load_calibration
 from gelflow.perception.synthetic.appearance import GelAppearance
 from gelflow.perception.synthetic.fast_renderer import FastGelRenderer

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from gelflow.cli.main import main
-from gelflow.cli.promises.outcome import Outcome, Promise, Row
 from gelflow.errors import UsageError
+from gelflow.mock_lab.promises.outcome import Outcome, Promise, Row
 from gelflow.policies.calibration.planning.motions import Plan
 from gelflow.policies.calibration.session_recordings import nothing_recorded
 from gelflow.session.motion_plan import PlannedMotion
@@ -56,8 +56,8 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
     replace("gelflow.sim.benchmark.tradeoff.sweep.measure", Tradeoff("pushing", (), {}, 1e-3, {}, 1))
     replace("gelflow.cli.commands.bench._measure", [])
-    replace("gelflow.cli.promises.outcome.measure", row)
-    replace("gelflow.cli.promises.endurance.measure_endurance", Endurance())
+    replace("gelflow.mock_lab.promises.outcome.measure", row)
+    replace("gelflow.mock_lab.promises.endurance.measure_endurance", Endurance())
     return made
 
 

@@ -8,13 +8,13 @@ from typing import Any
 
 import pytest
 
-import gelflow.cli.soak_case as soak_case
+import gelflow.mock_lab.soak.case as soak_case
 from gelflow.cli.main import main
-from gelflow.cli.mock_process import mock_robot
-from gelflow.cli.soak_case import REFUSED_WORLD, SoakCase, _outcome, _Watch
 from gelflow.errors import PeerError, PeerRefused
 from gelflow.hardware_mocks.faults.random_plan import random_plan
 from gelflow.hardware_mocks.simulated_cell.random_world import random_world
+from gelflow.mock_lab.robot_process import mock_robot
+from gelflow.mock_lab.soak.case import REFUSED_WORLD, SoakCase, _outcome, _Watch
 
 
 def row(seed: int, violations: list[str]) -> dict[str, Any]:

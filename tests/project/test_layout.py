@@ -71,6 +71,9 @@ ALLOWED = [
     ("src/gelflow/cli", "gelflow.policies"),
     ("src/gelflow/cli", "gelflow.hardware_mocks"),
     ("src/gelflow/cli", "gelflow.view"),
+    ("src/gelflow/cli", "gelflow.mock_lab"),
+    ("src/gelflow/mock_lab", "gelflow.real.wsg.driver"),
+    ("src/gelflow/mock_lab", "gelflow.hardware_mocks"),
     ("src/gelflow/view", "gelflow.sim"),
 ]
 REFUSED = [
@@ -87,6 +90,9 @@ REFUSED = [
     ("hardware_mocks", "gelflow.real.wsg.driver"),
     ("hardware_mocks", "gelflow.perception"),
     ("hardware_mocks", "gelflow.perception.tracker"),
+    ("src/gelflow/mock_lab", "gelflow.policies"),
+    ("src/gelflow/mock_lab", "gelflow.cli"),
+    ("real", "gelflow.mock_lab"),
     ("sim", "gelflow.cli"),
     ("sim", "gelflow.view"),
     ("sim/scene", "gelflow.sim.simulator"),

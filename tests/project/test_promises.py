@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from gelflow.cli.promises.outcome import Promise
-from gelflow.cli.promises.table import PROMISES
+from gelflow.mock_lab.promises.outcome import Promise
+from gelflow.mock_lab.promises.table import PROMISES
 
 ROOT = Path(__file__).resolve().parents[2]
 

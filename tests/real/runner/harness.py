@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gelflow.cli.mock_lab import lab_for
 from gelflow.hardware_mocks.robot import MockRobot
+from gelflow.mock_lab.lab import lab_for
 from gelflow.observation import FlowMap
 from gelflow.policies.checkpoint import save_checkpoint
 from gelflow.policies.networks.polynomial_mlp import PolynomialMLP

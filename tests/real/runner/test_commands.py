@@ -9,8 +9,8 @@ import pytest
 from tests.real.runner.harness import untrained_checkpoint
 
 from gelflow.cli.main import main
-from gelflow.cli.mock_process import mock_robot, true_state
 from gelflow.errors import PeerError, PeerTimeout
+from gelflow.mock_lab.robot_process import mock_robot, true_state
 from gelflow.real.runner import run_plan
 from gelflow.real.runner.lab_file import load_lab
 from gelflow.real.runner.run_plan import RunPlan

@@ -10,9 +10,9 @@ import pytest
 from tests.real.runner.harness import OraclePolicy, plan_for
 
 import gelflow.real
-from gelflow.cli.mock_lab import lab_for
 from gelflow.geometry import Pose
 from gelflow.hardware_mocks.robot import MockRobot
+from gelflow.mock_lab.lab import lab_for
 from gelflow.real.kinematics import inverse
 from gelflow.real.runner.insertion.attempt import Attempt
 from gelflow.real.runner.lab_file import load_lab

@@ -12,11 +12,11 @@ from tests.real.runner.harness import FACTOR, OraclePolicy, free_port, plan_for
 
 from gelflow.cli.insertion_text import insertion_to_json
 from gelflow.cli.main import main
-from gelflow.cli.mock_lab import lab_for
 from gelflow.gel.gel_file import ElasticGel, save_gel
 from gelflow.hardware_mocks.robot import MockRobot, MockRobotConfig
 from gelflow.hardware_mocks.simulated_cell.cell import SimulatedCellConfig
 from gelflow.hardware_mocks.simulated_cell.world import Gels, World
+from gelflow.mock_lab.lab import lab_for
 from gelflow.real.runner.insertion.attempt import Attempt, Insertion
 from gelflow.real.runner.run_plan import run_insertions
 from gelflow.session.reader import SessionReader

@@ -11,11 +11,11 @@ import pytest
 from numpy.typing import NDArray
 from tests.real.runner.harness import OraclePolicy, events, mean_displacement, plan_for
 
-from gelflow.cli.mock_lab import lab_for
 from gelflow.clock import ScaledClock
 from gelflow.errors import SafetyError
 from gelflow.geometry import Pose
 from gelflow.hardware_mocks.robot import MockRobot
+from gelflow.mock_lab.lab import lab_for
 from gelflow.observation import FlowMap
 from gelflow.real.runner.insertion.attempt import Attempt, Insertion
 from gelflow.real.runner.motion_executor import MotionExecutor, PartLost

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 from tests.real.runner.harness import OraclePolicy, events, plan_for
 
-from gelflow.cli.mock_lab import lab_for
 from gelflow.errors import PeerTimeout
 from gelflow.hardware_mocks.robot import MockRobot
+from gelflow.mock_lab.lab import lab_for
 from gelflow.real.runner.run_plan import run_insertions
 
 

@@ -16,9 +16,9 @@ from tests.real.runner.harness import BackgroundRun, OraclePolicy, events, movin
 from tests.real.wsg.harness import Relay, connected, unmodified
 
 from gelflow.cli.main import main
-from gelflow.cli.mock_lab import lab_for
 from gelflow.errors import GelflowError
 from gelflow.hardware_mocks.robot import MockRobot
+from gelflow.mock_lab.lab import lab_for
 from gelflow.real.runner.lab_file import save_lab
 from gelflow.real.runner.manual import gripper_actions
 from gelflow.real.runner.run_plan import run_insertions

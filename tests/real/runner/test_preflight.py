@@ -10,9 +10,9 @@ from tests.real.runner.harness import OraclePolicy, free_port, plan_for
 from tests.real.wsg.harness import Relay, unmodified
 
 from gelflow.cli.main import main
-from gelflow.cli.mock_lab import lab_for
 from gelflow.errors import GelflowError, PeerTimeout, SafetyError, UsageError
 from gelflow.hardware_mocks.robot import MockRobot
+from gelflow.mock_lab.lab import lab_for
 from gelflow.real.runner.lab import Lab
 from gelflow.real.runner.lab_file import load_lab, save_lab
 from gelflow.real.runner.run_plan import RunPlan, dry_run, run_insertions

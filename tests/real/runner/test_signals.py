@@ -15,8 +15,8 @@ from typing import Any
 import pytest
 from tests.real.runner.harness import events, moving, untrained_checkpoint, wait_for
 
-from gelflow.cli.mock_lab import lab_for
 from gelflow.hardware_mocks.robot import MockRobot
+from gelflow.mock_lab.lab import lab_for
 from gelflow.real.runner.lab_file import save_lab
 
 SOURCE = str(Path(__file__).resolve().parents[3] / "src")

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from tests.real.runner.harness import events
 
-from gelflow.cli.mock_lab import lab_for
 from gelflow.hardware_mocks.robot import MockRobot
+from gelflow.mock_lab.lab import lab_for
 from gelflow.real.egm.driver import EgmArm
 from gelflow.real.runner.cell import egm_config, open_cell
 from gelflow.real.runner.run_plan import create_motion

@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 from tests.real.runner.harness import BackgroundRun, OraclePolicy, events, moving, plan_for, wait_for
 
-from gelflow.cli.mock_lab import lab_for
 from gelflow.errors import GelflowError, SafetyError
 from gelflow.hardware_mocks.robot import MockRobot
+from gelflow.mock_lab.lab import lab_for
 from gelflow.real.runner.lab_file import save_lab
 from gelflow.real.runner.motion_executor import MotionExecutor
 from gelflow.real.runner.run_plan import run_insertions

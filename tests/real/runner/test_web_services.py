@@ -9,10 +9,10 @@ import pytest
 from tests.real.runner.harness import BackgroundRun, OraclePolicy, events, moving, plan_for, wait_for
 
 from gelflow.cli.main import main
-from gelflow.cli.mock_lab import lab_for
 from gelflow.errors import PeerError, SafetyError
 from gelflow.hardware_mocks.robot import MockRobot
 from gelflow.hardware_mocks.web_services.device import MockWebServices
+from gelflow.mock_lab.lab import lab_for
 from gelflow.real.runner.lab import Lab
 from gelflow.real.runner.lab_file import save_lab
 from gelflow.real.runner.run_plan import dry_run, run_insertions

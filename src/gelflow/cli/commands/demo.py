@@ -15,7 +15,6 @@ from rich.table import Table
 
 from gelflow.cli.exit_codes import SUCCESS
 from gelflow.cli.insertion_text import ATTEMPT_HEADER, attempt_line, insertion_to_json
-from gelflow.cli.mock_process import mock_robot, true_state
 from gelflow.cli.options import (
     add_checkpoint,
     add_json,
@@ -33,6 +32,7 @@ from gelflow.cli.options import (
 from gelflow.cli.output import Output, progress_bar
 from gelflow.errors import GelflowError, PeerTimeout, UsageError
 from gelflow.interrupts import interruptible
+from gelflow.mock_lab.robot_process import mock_robot, true_state
 from gelflow.session.reader import is_being_recorded
 from gelflow.task import InsertionTask
 

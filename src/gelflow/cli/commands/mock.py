@@ -55,12 +55,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the mock robot until Ctrl-C, SIGTERM, or with --attached the end of standard input."""
-    from gelflow.cli.mock_lab import lab_for
     from gelflow.hardware_mocks.faults.plan import FaultPlan
     from gelflow.hardware_mocks.faults.plan_file import load_fault_plan
     from gelflow.hardware_mocks.robot import MockRobot, MockRobotConfig
     from gelflow.hardware_mocks.simulated_cell.cell import preset_config
     from gelflow.hardware_mocks.simulated_cell.world import load_world
+    from gelflow.mock_lab.lab import lab_for
     from gelflow.real.runner.lab_file import save_lab
 
     check_at_least(args, seed=0, jitter=0)

@@ -15,8 +15,8 @@ from gelflow.errors import PeerError, UsageError
 from gelflow.toml_tables import suggestion
 
 if TYPE_CHECKING:
-    from gelflow.cli.soak_case import SoakCase
-    from gelflow.real.soak.ledger import Ledger
+    from gelflow.mock_lab.soak.case import SoakCase
+    from gelflow.mock_lab.soak.ledger import Ledger
 
 _FAILED_STARTS = 3  # of the mock robot, in sequence, after which the soak test ends
 # Options of random plans only, and their defaults.
@@ -71,9 +71,9 @@ def _check_options(args: argparse.Namespace) -> None:
 
 def _run_promises(args: argparse.Namespace) -> int:
     """Measure the promises one after the other."""
-    from gelflow.cli.promises.outcome import Row, measure
-    from gelflow.cli.promises.report import remarks, table, to_json, write_json
-    from gelflow.cli.promises.table import PROMISES
+    from gelflow.mock_lab.promises.outcome import Row, measure
+    from gelflow.mock_lab.promises.report import remarks, table, to_json, write_json
+    from gelflow.mock_lab.promises.table import PROMISES
     from gelflow.policies.training.folder import create_folder
 
     output = Output(args.json)
@@ -99,8 +99,8 @@ def _run_promises(args: argparse.Namespace) -> int:
 
 def _run_endurance(args: argparse.Namespace) -> int:
     """Run EGM with cameras, tracking and recording for some minutes."""
-    from gelflow.cli.promises.endurance import BOUND, measure_endurance
-    from gelflow.cli.promises.report import write_json
+    from gelflow.mock_lab.promises.endurance import BOUND, measure_endurance
+    from gelflow.mock_lab.promises.report import write_json
     from gelflow.policies.training.folder import create_folder
 
     if not 0 < args.egm <= 1440:
@@ -119,8 +119,8 @@ def _run_endurance(args: argparse.Namespace) -> int:
 
 def _run_plans(args: argparse.Namespace) -> int:
     """Run the plans that the folder does not contain yet, then print all counts."""
-    from gelflow.cli.soak_case import SoakCase
-    from gelflow.real.soak.ledger import Ledger
+    from gelflow.mock_lab.soak.case import SoakCase
+    from gelflow.mock_lab.soak.ledger import Ledger
     from gelflow.sim.scene import load_scene
 
     check_at_least(args, plans=1, seed=0, jobs=1, jitter=0, factor=1)
@@ -158,7 +158,7 @@ def _run_all(cases: "list[SoakCase]", ledger: "Ledger", output: Output, args: ar
 
     Raises PeerError when the mock robot repeatedly fails to start.
     """
-    from gelflow.cli.soak_case import try_case
+    from gelflow.mock_lab.soak.case import try_case
 
     failed = 0
     not_run: dict[int, str] = {}
@@ -196,7 +196,7 @@ def _line(seed: int, row: dict[str, Any]) -> str:
 
 def _show(output: Output, ledger: "Ledger") -> None:
     """Tables of the outcomes, of the kinds of faults, and of the rules."""
-    from gelflow.real.soak.rules import RULES
+    from gelflow.mock_lab.soak.rules import RULES
 
     counts, rows = ledger.counts(), list(ledger.rows.values())
     table = Table(title=f"Soak test: {len(rows)} plans")

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from tests.real.runner.harness import BackgroundRun, OraclePolicy, events, free_port, plan_for, wait_for
 
-from gelflow.cli.mock_lab import lab_for
 from gelflow.errors import GelflowError
 from gelflow.hardware_mocks.robot import MockRobot, MockRobotConfig
 from gelflow.hardware_mocks.simulated_cell.cell import SimulatedCellConfig
 from gelflow.hardware_mocks.simulated_cell.world import world_from_tables
+from gelflow.mock_lab.lab import lab_for
 from gelflow.real.runner.insertion.attempt import Insertion
 from gelflow.real.runner.run_plan import run_insertions
 from gelflow.task import INSERTION, PUBLISHED_INSERTION, InsertionTask

@@ -14,10 +14,10 @@ from gelflow.errors import UsageError
 from gelflow.geometry import Pose, yaw_quaternion
 from gelflow.hardware_mocks.simulated_cell.random_world import changed_groups, random_world
 from gelflow.hardware_mocks.simulated_cell.world import World, plain_world, world_from_tables
+from gelflow.mock_lab.soak.ledger import Ledger
+from gelflow.mock_lab.soak.rules import RULES, RunFacts, violations
+from gelflow.mock_lab.soak.session_facts import SessionFacts, longest_wait, read_session
 from gelflow.real.runner import lab as labs
-from gelflow.real.soak.ledger import Ledger
-from gelflow.real.soak.rules import RULES, RunFacts, violations
-from gelflow.real.soak.session_facts import SessionFacts, longest_wait, read_session
 from gelflow.session.recorder import SessionRecorder
 from gelflow.toml_tables import read_toml, toml_text
 

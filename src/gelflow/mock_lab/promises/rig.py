@@ -18,13 +18,13 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from gelflow.cli.mock_lab import lab_for
-from gelflow.cli.mock_process import free_port
 from gelflow.errors import PeerError
 from gelflow.hardware_mocks.robot import MockRobot, MockRobotConfig
 from gelflow.hardware_mocks.simulated_cell.cell import SimulatedCellConfig
 from gelflow.hardware_mocks.simulated_cell.insertion_progress import PHASES, InsertionProgress
 from gelflow.hardware_mocks.simulated_cell.world import World
+from gelflow.mock_lab.lab import lab_for
+from gelflow.mock_lab.robot_process import free_port
 from gelflow.protocols import CameraImage
 from gelflow.real.runner.lab import Lab, LimitsSettings
 from gelflow.real.runner.lab_file import save_lab

@@ -16,12 +16,12 @@ from typing import Any
 
 import numpy as np
 
-from gelflow.cli.promises.report import load
-from gelflow.cli.promises.rig import Rig, near_seed
 from gelflow.errors import PeerError, PeerTimeout
 from gelflow.geometry import Pose
 from gelflow.measurement.machine import processor
 from gelflow.measurement.stalls import StallWatch, overlaps
+from gelflow.mock_lab.promises.report import load
+from gelflow.mock_lab.promises.rig import Rig, near_seed
 from gelflow.real.egm.cycle_log import EgmCycle
 from gelflow.real.egm.reference_generator import EgmFlag
 from gelflow.real.runner.cell import Cell, open_cell
@@ -154,7 +154,7 @@ def measure_endurance(seconds: float, progress: Callable[[float], object] = lamb
     before = load()
     with tempfile.TemporaryDirectory(prefix="gelflow-egm-") as name, Rig(Path(name), seed=near_seed()) as rig:
         save_lab(rig.lab, rig.folder / "lab.toml", title="Written by gelflow soak --egm.")
-        arguments = [sys.executable, "-m", "gelflow.cli.promises.endurance", str(rig.folder), repr(seconds)]
+        arguments = [sys.executable, "-m", "gelflow.mock_lab.promises.endurance", str(rig.folder), repr(seconds)]
         late = rig.robot.arm.report.late
         with StallWatch() as watch:
             values = json.loads(_run(arguments, seconds + _START_LIMIT, progress))
@@ -245,9 +245,9 @@ def _move_and_track(cell: Cell, motion: MotionExecutor, end: float, images: list
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Entry point of the runner's process; prints the counts as JSON."""
+    """Entry point of the runner's process; writes the counts as JSON to standard output."""
     sys.setswitchinterval(5e-4)  # as `gelflow run` does
-    print(json.dumps(run_devices(Path(arguments[0]), float(arguments[1]))))
+    sys.stdout.write(json.dumps(run_devices(Path(arguments[0]), float(arguments[1]))) + "\n")
     return 0
 
 

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from gelflow.cli.promises.rig import FalseStop
 from gelflow.errors import GelflowError
+from gelflow.mock_lab.promises.rig import FalseStop
 
 _TRIES = 3  # of a scenario that a busy computer ended before its fault
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
-from gelflow.real.soak.session_facts import SessionFacts
+from gelflow.mock_lab.soak.session_facts import SessionFacts
 
 MAX_PUSH = 1e-3  # largest slip of a part in the grip without a stop [m]
 _HOLD_MOTION = 50e-6  # largest change of the reference after a latch that counts as a hold [m]

@@ -8,9 +8,9 @@ from typing import Any
 
 from rich.table import Table
 
-from gelflow.cli.promises.outcome import Row
 from gelflow.errors import UsageError
 from gelflow.measurement.machine import processor
+from gelflow.mock_lab.promises.outcome import Row
 from gelflow.session.records import to_plain
 
 

@@ -10,11 +10,11 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from gelflow.cli.promises.outcome import Outcome, conditions
-from gelflow.cli.promises.rig import Rig, Run, RunningRunner, end_after, far_seed, gripped, in_descent, near_seed
 from gelflow.hardware_mocks.robot import MockRobot
 from gelflow.hardware_mocks.simulated_cell.insertion_progress import InsertionProgress
 from gelflow.hardware_mocks.simulated_cell.world import TaughtError, World
+from gelflow.mock_lab.promises.outcome import Outcome, conditions
+from gelflow.mock_lab.promises.rig import Rig, Run, RunningRunner, end_after, far_seed, gripped, in_descent, near_seed
 from gelflow.session.reader import SessionReader
 from gelflow.session.recovery import recover
 

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from gelflow.cli.promises.outcome import Outcome, conditions
-from gelflow.cli.promises.rig import Rig, Run, end_after, far_seed, in_descent, near_seed, while_lowering
 from gelflow.errors import SafetyError, UsageError
 from gelflow.geometry import Pose, yaw_quaternion
+from gelflow.mock_lab.promises.outcome import Outcome, conditions
+from gelflow.mock_lab.promises.rig import Rig, Run, end_after, far_seed, in_descent, near_seed, while_lowering
 from gelflow.real.egm import driver as driver_module
 from gelflow.real.egm.driver import EgmArm
 from gelflow.real.runner import supervisor as supervisor_module

@@ -13,11 +13,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any
 
-from gelflow.cli.exit_codes import ERROR
 from gelflow.errors import PeerError, PeerRefused
 
 _START_LIMIT = 60.0  # of the mock robot [s, wall]
 _STOP_LIMIT = 10.0  # [s, wall]
+_REFUSED = 2  # exit code of `gelflow mock` for wrong options
 
 
 @contextlib.contextmanager
@@ -81,7 +81,7 @@ def _await_file(path: Path, process: subprocess.Popen[bytes], errors: IO[bytes])
         if process.poll() is not None or time.monotonic() > end:
             errors.seek(0)
             lines = errors.read().decode(errors="replace").strip().splitlines()
-            kind = PeerRefused if process.returncode == ERROR else PeerError
+            kind = PeerRefused if process.returncode == _REFUSED else PeerError
             raise kind(f"the mock robot did not start: {lines[-1] if lines else 'no reason given'}")
         time.sleep(0.05)
 

@@ -6,11 +6,11 @@ from pathlib import Path
 import pytest
 
 from gelflow.cli.main import main
-from gelflow.cli.promises.endurance import CycleStatistics
-from gelflow.cli.promises.outcome import Outcome, Promise, conditions, measure
-from gelflow.cli.promises.report import remarks, to_json
-from gelflow.cli.promises.rig import FalseStop, far_seed, near_seed
 from gelflow.errors import PeerError
+from gelflow.mock_lab.promises.endurance import CycleStatistics
+from gelflow.mock_lab.promises.outcome import Outcome, Promise, conditions, measure
+from gelflow.mock_lab.promises.report import remarks, to_json
+from gelflow.mock_lab.promises.rig import FalseStop, far_seed, near_seed
 from gelflow.real.egm.cycle_log import EgmCycle
 from gelflow.real.egm.reference_generator import EgmFlag
 

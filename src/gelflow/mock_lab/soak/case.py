@@ -11,17 +11,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gelflow.cli.mock_process import mock_robot, true_state
 from gelflow.errors import PeerError, PeerRefused
 from gelflow.hardware_mocks.faults.plan import FaultPlan
 from gelflow.hardware_mocks.faults.plan_file import plan_to_tables
 from gelflow.hardware_mocks.faults.random_plan import random_plan
 from gelflow.hardware_mocks.simulated_cell.random_world import changed_groups, random_world
 from gelflow.hardware_mocks.simulated_cell.world import World, plain_world
+from gelflow.mock_lab.robot_process import mock_robot, true_state
+from gelflow.mock_lab.soak.rules import RunFacts, violations
+from gelflow.mock_lab.soak.session_facts import longest_wait, read_session
 from gelflow.real.runner.lab import Lab
 from gelflow.real.runner.lab_file import load_lab
-from gelflow.real.soak.rules import RunFacts, violations
-from gelflow.real.soak.session_facts import longest_wait, read_session
 from gelflow.toml_tables import toml_text
 
 REFUSED_WORLD = "no insertion: the mock robot refused the world"

@@ -2,11 +2,11 @@
 
 import signal
 
-from gelflow.cli.promises import faults, refusals
-from gelflow.cli.promises.faults import blind, interrupted, robot_fault
-from gelflow.cli.promises.outcome import Promise
-from gelflow.cli.promises.refusals import refused_run
-from gelflow.cli.promises.rig import while_lowering
+from gelflow.mock_lab.promises import faults, refusals
+from gelflow.mock_lab.promises.faults import blind, interrupted, robot_fault
+from gelflow.mock_lab.promises.outcome import Promise
+from gelflow.mock_lab.promises.refusals import refused_run
+from gelflow.mock_lab.promises.rig import while_lowering
 
 _STOPS = "tests/real/runner/test_stops.py::test_stale_data_or_a_fault_holds_the_arm_and_ends_the_run"
 _EGM_STOPS = "tests/real/egm/test_stops.py"

@@ -1,5 +1,0 @@
-"""Soak tests: checks of recorded runs under faults, and the file of their results."""
-
-import lazy_loader as _lazy
-
-__getattr__, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)
