@@ -1,3 +1,5 @@
+from .backpropagation import Backpropagation as Backpropagation
+from .backpropagation import BackpropagationSettings as BackpropagationSettings
 from .checkpoint import Checkpoint as Checkpoint
 from .checkpoint import default_checkpoint as default_checkpoint
 from .checkpoint import load_checkpoint as load_checkpoint
@@ -14,6 +16,7 @@ from .networks.base import Architecture as Architecture
 from .networks.base import BatchPolicy as BatchPolicy
 from .networks.base import Network as Network
 from .networks.flow_map_policy import NetworkPolicy as NetworkPolicy
+from .networks.mlp import MLP as MLP
 from .networks.polynomial_gru import PolynomialGRU as PolynomialGRU
 from .networks.polynomial_gru import PolynomialGRUNetwork as PolynomialGRUNetwork
 from .networks.polynomial_mlp import PolynomialMLP as PolynomialMLP
@@ -25,7 +28,10 @@ from .training.run import Progress as Progress
 from .training.run import TrainingResult as TrainingResult
 
 __all__ = [
+    "MLP",
     "Architecture",
+    "Backpropagation",
+    "BackpropagationSettings",
     "BatchPolicy",
     "Checkpoint",
     "EvaluationResult",

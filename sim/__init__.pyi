@@ -14,6 +14,7 @@ from .scene.loader import scene_names as scene_names
 from .scene.scene import Scene as Scene
 from .simulator import STATUS_MESSAGES as STATUS_MESSAGES
 from .simulator import Simulator as Simulator
+from .tasks.differentiable_pushing import DifferentiablePushing as DifferentiablePushing
 from .tasks.gripper.flow_map_noise import FlowMapNoise as FlowMapNoise
 from .tasks.gymnasium_envs import TaskEnv as TaskEnv
 from .tasks.gymnasium_envs import TaskVectorEnv as TaskVectorEnv
@@ -21,6 +22,8 @@ from .tasks.insertion import InsertionAttempts as InsertionAttempts
 from .tasks.insertion import insertion_scene as insertion_scene
 from .tasks.insertion_environments import InsertionEnv as InsertionEnv
 from .tasks.insertion_environments import InsertionVectorEnv as InsertionVectorEnv
+from .tasks.pushing import Pushing as Pushing
+from .tasks.pushing import PushingTask as PushingTask
 from .tasks.randomization import Fixed as Fixed
 from .tasks.randomization import LogUniform as LogUniform
 from .tasks.randomization import Normal as Normal
@@ -44,6 +47,7 @@ from .validation.energy import EnergyGauge as EnergyGauge
 __all__ = [
     "STATUS_MESSAGES",
     "Camera",
+    "DifferentiablePushing",
     "Energy",
     "EnergyGauge",
     "Fixed",
@@ -54,6 +58,8 @@ __all__ = [
     "LogUniform",
     "Normal",
     "Polyline",
+    "Pushing",
+    "PushingTask",
     "Randomization",
     "Scene",
     "Simulator",
