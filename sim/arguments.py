@@ -12,11 +12,14 @@ MAX_INTEGER = 2**31 - 1  # of the core
 
 
 def checked(function: Callable[..., Any], *arguments: Any) -> Any:
-    """The result of a function of the core, whose ValueError and TypeError become a UsageError."""
+    """The result of a function of the core, whose errors become a UsageError, lack of memory included."""
     try:
         return function(*arguments)
     except ValueError as error:
         raise UsageError(str(error)) from None
+    except MemoryError:
+        name = getattr(function, "__name__", "core")
+        raise UsageError(f"{name}: not enough memory; use fewer environments or a smaller model") from None
     except TypeError:  # the message of pybind11 has many lines
         types = ", ".join(type(argument).__name__ for argument in arguments)
         raise UsageError(f"{getattr(function, '__name__', 'core')}: arguments of these types: {types}") from None

@@ -8,8 +8,10 @@ be passed by name as tensors; their gradient is computed only when a tensor requ
 Paper: Xu et al., Efficient Tactile Simulation with Differentiability for Robotic Manipulation, CoRL 2022.
 """
 
+import threading
+import weakref
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -177,8 +179,7 @@ class _Rollout(torch.autograd.Function):
         options: dict[str, Any],
     ) -> tuple[torch.Tensor, ...]:
         # The reverse pass needs the parameters of the forward pass, even if sim.params changes in between.
-        ctx.params = sim.params.copy() if params is None else params.detach().numpy()
-        with nullcontext() if params is None else _temporary_params(sim, ctx.params):
+        with _temporary_params(sim, None if params is None else params.detach().numpy()) as ctx.params:
             trajectory = sim.rollout(
                 u.detach().numpy(),
                 q=q.detach().numpy(),
@@ -227,12 +228,27 @@ class _Rollout(torch.autograd.Function):
         return (*(torch.from_numpy(array) for array in arrays), grad_params, None, None, None)
 
 
+_locks: "weakref.WeakKeyDictionary[Simulator, threading.Lock]" = weakref.WeakKeyDictionary()
+
+
 @contextmanager
-def _temporary_params(sim: Simulator, params: NDArray[Any]) -> Iterator[None]:
-    """Replace the parameters of the simulator within a context."""
-    kept = sim.params.copy()
-    sim.params[:] = params
+def _temporary_params(sim: Simulator, params: NDArray[Any] | None) -> Iterator[NDArray[Any]]:
+    """Replace the parameters of the simulator within a context, None: keep them; yields a copy of those in the context.
+
+    Raises UsageError while another thread is in such a context.
+    """
+    lock = _locks.setdefault(sim, threading.Lock())
+    if not lock.acquire(blocking=False):
+        raise UsageError("the simulator is busy with a call of another thread; give each thread its own simulator")
     try:
-        yield
+        kept = sim.params.copy()
+        if params is None:
+            yield kept
+            return
+        sim.params[:] = params
+        try:
+            yield params
+        finally:
+            sim.params[:] = kept
     finally:
-        sim.params[:] = kept
+        lock.release()

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
-from gelflow.sim.arguments import shown
+from gelflow.sim.arguments import number_array, shown
 from gelflow.sim.drawing.scene_drawing import Polyline, SceneDrawing
 from gelflow.sim.scene.mjcf.mechanics import WORLD, GeomDef
 from gelflow.toml_tables import suggestion
@@ -31,8 +31,9 @@ class Camera:
     fov: float = 40.0  # vertical field of view [deg]
 
     def __post_init__(self) -> None:
-        numbers = (*self.target, self.distance, self.azimuth, self.elevation, self.fov)
-        if len(self.target) != 3 or not np.isfinite(numbers).all():
+        target = number_array("camera: target", self.target, float)
+        others = number_array("camera", (self.distance, self.azimuth, self.elevation, self.fov), float)
+        if target.shape != (3,) or not (np.isfinite(target).all() and np.isfinite(others).all()):
             raise UsageError(f"camera: target must be three numbers, and all numbers finite, got {shown(self)}")
         if not (self.distance > 0 and 0 < self.fov < 180 and abs(self.elevation) <= 90):
             raise UsageError(

@@ -80,8 +80,10 @@ class Renderer:
         return self._start
 
     def _caster_for(self, drawing: SceneDrawing) -> RayCaster:
-        """The caster of the geometries; a new one where sizes or positions on the bodies have changed."""
-        key = tuple(part.tobytes() for geom in drawing.geoms for part in (geom.size, geom.pose.position))
+        """The caster of the geometries; a new one where sizes or poses on the bodies have changed."""
+        key = tuple(
+            part.tobytes() for geom in drawing.geoms for part in (geom.size, geom.pose.position, geom.pose.quaternion)
+        )
         if self._caster is None or key != self._key:
             self._caster, self._key = RayCaster(drawing.geoms, len(drawing.poses)), key
         return self._caster

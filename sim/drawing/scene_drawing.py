@@ -101,7 +101,8 @@ def drawn_geoms(sim: Simulator, env: int) -> tuple[GeomDef, ...]:
 
 
 def _shape_geom(sim: Simulator, env: int, shape: ShapeDef, file: GeomDef | None) -> GeomDef:
-    size, pose = _vector(sim, env, "shape", f"{shape.name}.size"), _pose(sim, env, "shape", shape.name, shape.pose)
+    size = _vector(sim, env, "shape", f"{shape.name}.size")
+    pose = _pose(sim, env, "shape", f"{shape.name}.shape", shape.pose)
     if shape.grid is None:
         return GeomDef(shape.name, shape.body, shape.kind, pose, size)
     mesh = file.mesh if file is not None and file.mesh is not None else grid_mesh(shape.grid)
@@ -110,8 +111,8 @@ def _shape_geom(sim: Simulator, env: int, shape: ShapeDef, file: GeomDef | None)
 
 
 def _pose(sim: Simulator, env: int, kind: str, name: str, pose: Pose) -> Pose:
-    """The pose in its body of a shape or a point set of an environment; `pose` is that of the scene."""
-    position, turn = (_vector(sim, env, kind, f"{name}.{kind}.{key}") for key in ("pos", "turn"))
+    """The pose in its body of a shape, a point set or a pad of an environment; `pose` is that of the scene."""
+    position, turn = (_vector(sim, env, kind, f"{name}.{key}") for key in ("pos", "turn"))
     half = np.linalg.norm(turn) / 2
     rotation = (np.cos(half), *(0.5 * np.sinc(half / np.pi) * turn))
     return Pose(position, np.array(multiply(pose.quaternion, rotation)))
@@ -153,9 +154,9 @@ def _contact_forces(sim: Simulator, env: int, poses: Sequence[Pose]) -> tuple[Co
             continue
         cloud, shape = clouds[contact.points], shapes[contact.shape]
         scaled = _vector(sim, env, "points", f"{cloud.name}.points.scale") * cloud.pose.inverse().apply(cloud.points)
-        points = _pose(sim, env, "points", cloud.name, cloud.pose).apply(scaled)
+        points = _pose(sim, env, "points", f"{cloud.name}.points", cloud.pose).apply(scaled)
         points = points if cloud.body == WORLD else poses[cloud.body].apply(points)
-        frame = _pose(sim, env, "shape", shape.name, shape.pose)
+        frame = _pose(sim, env, "shape", f"{shape.name}.shape", shape.pose)
         frame = frame if shape.body == WORLD else poses[shape.body] @ frame
         distance, normal = _distance(sim, env, shape, frame.inverse().apply(points))
         points = points - cloud.radius * normal @ frame.matrix().T  # of a sphere, the point next to the shape
@@ -186,12 +187,18 @@ def _pad_readings(sim: Simulator, env: int, poses: Sequence[Pose]) -> tuple[PadR
     if not scene.pads:
         return ()
     forces = sim.tactile()[env].astype(float)
-    return tuple(_pad_reading(pad, forces[scene.marker_slice(pad.name)], poses) for pad in scene.pads)
+    readings = []
+    for pad in scene.pads:
+        mount = _pose(sim, env, "pad", f"{pad.name}.markers", pad.pose)
+        readings.append(_pad_reading(pad, forces[scene.marker_slice(pad.name)], mount, poses))
+    return tuple(readings)
 
 
-def _pad_reading(pad: PadDef, forces: Array, poses: Sequence[Pose]) -> PadReading:
+def _pad_reading(pad: PadDef, forces: Array, mount: Pose, poses: Sequence[Pose]) -> PadReading:
+    """The reading of a pad; `mount` is its present pose on its body."""
     rotation = pad.pose.matrix()
-    positions = pad.positions if pad.body == WORLD else poses[pad.body].apply(pad.positions)
+    on_body = (mount @ pad.pose.inverse()).apply(pad.positions)
+    positions = on_body if pad.body == WORLD else poses[pad.body].apply(on_body)
     layout = ((pad.positions - pad.pose.position) @ rotation)[:, :2]
     shear = (np.einsum("mij,mj->mi", pad.axes[:, :, :2], forces[:, :2]) @ rotation)[:, :2]
     return PadReading(pad.name, positions, layout, shear, forces[:, 2])

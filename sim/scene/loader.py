@@ -134,15 +134,12 @@ def find_scene(scene: str | Path) -> Path:
     """The file of a scene, by name or path. Raises UsageError for an unknown name."""
     if not isinstance(scene, str | Path):
         raise UsageError(f"scene must be a name or a path, got {type(scene).__name__}")
-    path = Path(scene)
+    path, names = Path(scene), scene_names()
+    if scene in names:  # even if the working directory has a file of this name
+        return Path(str(_shipped_scenes())) / f"{scene}.toml"
     if path.suffix in (".toml", *MODEL_SUFFIXES) or path.is_file():
         return path
-    shipped = Path(str(_shipped_scenes())) / f"{scene}.toml"
-    if not shipped.is_file():
-        raise UsageError(
-            f"no scene {str(scene)!r}; {suggestion(str(scene), scene_names())} (or give a .toml, .xml or .urdf file)"
-        )
-    return shipped
+    raise UsageError(f"no scene {str(scene)!r}; {suggestion(str(scene), names)} (or give a .toml, .xml or .urdf file)")
 
 
 def _shipped_scenes() -> Traversable:

@@ -2,6 +2,7 @@
 
 import importlib
 import inspect
+from collections.abc import Mapping
 from types import ModuleType
 from typing import Any
 
@@ -47,7 +48,7 @@ def make_task(name: str, num_envs: int, **options: Any) -> TaskBatch:
     check_type("task", options.get("task", description), type(description), f"of type {type(description).__name__}")
     if isinstance(table := options.get("randomization"), str):
         options["randomization"] = _named_randomization(name, table, options.get("task"))
-    ranges, samples = options.pop("ranges", None) or {}, options.pop("samples", None) or {}
+    ranges, samples = (_mapping(key, options.pop(key, None)) for key in ("ranges", "samples"))
     if ranges or samples:
         table = options.get("randomization") or _named_randomization(name, "default", options.get("task"))
         options["randomization"] = table.replace(**ranges).drawn_from(samples)
@@ -55,9 +56,20 @@ def make_task(name: str, num_envs: int, **options: Any) -> TaskBatch:
         options.pop("randomization", None)
     else:
         check_type("randomization", options["randomization"], Randomization, "the name of a table or a Randomization")
+    parameters = inspect.signature(batch_class).parameters
+    unknown = sorted(options.keys() - parameters.keys())
+    # A class that takes others checks them itself.
+    if unknown and all(parameter.kind is not parameter.VAR_KEYWORD for parameter in parameters.values()):
+        raise UsageError(f"{name} has no option {unknown[0]!r}; {suggestion(unknown[0], parameters)}")
     batch = batch_class(num_envs, **options)
     assert isinstance(batch, TaskBatch)
     return batch
+
+
+def _mapping(name: str, value: Any) -> Mapping[str, Any]:
+    """The mapping, empty for None. Raises UsageError for another value."""
+    check_type(name, value, Mapping | None, "a mapping of quantities")
+    return value or {}
 
 
 def _named_randomization(name: str, table: str, task: TaskDescription | None) -> Randomization:

@@ -93,6 +93,7 @@ class Rolling(ControlTask):
             "rows": grid.rows,
             "cols": grid.cols,
             "size": [1e-3 * grid.pitch * n for n in (grid.rows, grid.cols)],
+            "center": [1e-3 * value for value in grid.center],
         }
         super().__init__(
             task,

@@ -10,6 +10,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from gelflow.errors import UsageError
 from gelflow.geometry import rotated
 from gelflow.sim.tasks.randomization import Fixed, LogUniform, Quantity, Uniform
 
@@ -85,8 +86,12 @@ class SensorModel:
         """New pads in the environments `which`.
 
         `sampled` has the levels of all effects, (n,) each, and may have `PAIR_QUANTITIES` of two pads.
+
+        Raises UsageError for a negative level.
         """
         for name, level in self._level.items():
+            if (np.asarray(sampled[name]) < 0).any():
+                raise UsageError(f"randomization: {name} must not be negative, got {np.min(sampled[name]):g}")
             level[which] = sampled[name]
         count, pads, total = int(which.sum()), self.gain.shape[1], len(self._pad_of)
 
@@ -162,7 +167,7 @@ class SensorModel:
         before[rest] = delayed[rest] = forces[rest]
         tau = self._level["gel_time"][rows, None, None]
         ramp = (forces - before) * (tau / interval) if interval > 0 else np.zeros_like(forces)
-        decay = np.exp(-interval / tau)
+        decay = np.exp(-interval / np.maximum(tau, 1e-12))  # without a delay all of it has decayed
         delayed = forces - ramp + (delayed - before + ramp) * decay
         self._input[rows], self._delayed[rows] = forces, delayed
         self._at_rest[rows] = False

@@ -46,13 +46,25 @@ GELFLOW_INLINE void set_rotation_axes(Workspace<T>& w, int k, const M3<Scalar>& 
   }
 }
 
+// The rotation of a quaternion of any length. One of unit length is taken as it is: its rounding stays.
+template <class Scalar>
+GELFLOW_INLINE M3<Scalar> rotation_of_any(const Scalar* value) {
+  using std::abs;
+  using std::sqrt;
+  const V4<Scalar> q = vec4(value);
+  const Scalar squared = q.squaredNorm();
+  constexpr double rounding = 1e-6;
+  if (abs(squared - Scalar(1)) <= Scalar(rounding)) return rotation_of<Scalar>(q);
+  return rotation_of<Scalar>(q * (Scalar(1) / sqrt(squared)));
+}
+
 // Moves the body frame (r, p) by one joint, with positions `value`, and sets the joint's axes.
 template <class T, class Scalar>
 GELFLOW_INLINE void apply_joint(const Joint& joint, const Scalar* value, M3<Scalar>& r, V3<Scalar>& p,
                                 Workspace<T>& w) {
   if (joint.type == JointType::free) {
     p = vec3(value);
-    r = rotation_of<Scalar>(V4<Scalar>(value[3], value[4], value[5], value[6]));
+    r = rotation_of_any<Scalar>(value + 3);
     for (int a = 0; a < 3; ++a) set_axis<T, Scalar>(w, joint.v + a, V3<Scalar>::Zero(), V3<Scalar>::Unit(a));
     set_rotation_axes<T, Scalar>(w, joint.v + 3, r, p);
     return;
@@ -60,7 +72,7 @@ GELFLOW_INLINE void apply_joint(const Joint& joint, const Scalar* value, M3<Scal
   if (joint.type == JointType::ball) {
     const V3<Scalar> offset = joint.pos.template cast<Scalar>();
     const V3<Scalar> anchor = p + r * offset;
-    r = (r * rotation_of<Scalar>(V4<Scalar>(value[0], value[1], value[2], value[3]))).eval();
+    r = (r * rotation_of_any<Scalar>(value)).eval();
     p = anchor - r * offset;
     set_rotation_axes<T, Scalar>(w, joint.v, r, anchor);
     return;
@@ -237,7 +249,7 @@ VX<T> dposition_dposition_vjp(const Model& m, const VX<T>& increment, VX<T> lamb
 }
 
 // Gradients with respect to q: from quaternion components to the tangent (right perturbation), and back. Quaternions may
-// have any length: the dynamics normalize them.
+// have any length: the kinematics normalize them.
 template <class T>
 VX<T> to_tangent(const Model& m, const T* q, const T* gradient) {
   VX<T> result(m.nv);

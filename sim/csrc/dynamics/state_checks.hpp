@@ -25,7 +25,7 @@ void check_finite(const T* values, const char* name, int environments, int width
   }
 }
 
-// Of positions (environments, nq): a quaternion may have any length but 0, since the dynamics normalize it.
+// Of positions (environments, nq): a quaternion may have any length but 0, since the kinematics normalize it.
 template <class T>
 void check_quaternions(const Model& m, const T* positions, int environments, const std::uint8_t* active) {
   for (const Joint& joint : m.joints) {

@@ -1,6 +1,7 @@
 """Parsing and compilation of model files by MuJoCo."""
 
 import re
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -12,7 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
-from gelflow.sim.scene.mjcf.urdf import compile_urdf, complete_urdf, read_urdf
+from gelflow.sim.scene.mjcf.urdf import compile_urdf, parse_urdf, read_urdf
+
+_COMPILING = threading.Lock()
 
 
 @dataclass(frozen=True)
@@ -35,14 +38,14 @@ def compile_model(path: Path) -> CompiledModel:
         raise UsageError(f"no such model file: {path}")
     robot = read_urdf(path)
     spec = None
-    if hasattr(mujoco, "mj_clearCache"):  # its cache does not notice a mesh that changes within a second
-        mujoco.mj_clearCache(mujoco.mj_getCache())
     try:
         with _no_log_file():
-            spec = mujoco.MjSpec.from_file(str(path))
+            if hasattr(mujoco, "mj_clearCache"):  # its cache does not notice a mesh that changes within a second
+                mujoco.mj_clearCache(mujoco.mj_getCache())
             if robot is None:
+                spec = mujoco.MjSpec.from_file(str(path))
                 return _compiled(spec, spec.compile(), path, urdf=False)
-            complete_urdf(spec, robot, path)
+            spec = parse_urdf(robot, path)
             return _compiled(spec, compile_urdf(spec, path), path, urdf=True)
     except UsageError:
         raise
@@ -52,13 +55,17 @@ def compile_model(path: Path) -> CompiledModel:
 
 @contextmanager
 def _no_log_file() -> Iterator[None]:
-    """MuJoCo writes its warnings into MUJOCO_LOG.TXT of the working directory, in addition to Python's warnings."""
-    handler = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(handler or (lambda _: None))
-    try:
-        yield
-    finally:
-        mujoco.set_mju_user_warning(handler)
+    """MuJoCo writes its warnings into MUJOCO_LOG.TXT of the working directory, in addition to Python's warnings.
+
+    Its handler of warnings and its cache belong to the process, so one thread at a time compiles.
+    """
+    with _COMPILING:
+        handler = mujoco.get_mju_user_warning()
+        mujoco.set_mju_user_warning(handler or (lambda _: None))
+        try:
+            yield
+        finally:
+            mujoco.set_mju_user_warning(handler)
 
 
 def _compiled(spec: Any, model: Any, path: Path, *, urdf: bool) -> CompiledModel:
@@ -75,6 +82,8 @@ def _compiled(spec: Any, model: Any, path: Path, *, urdf: bool) -> CompiledModel
             f"{path}: mocap body {taken[0]!r} gets a free joint of its name, but the model has a joint "
             f"{taken[0]!r}; rename one of them"
         )
+    if spec.compiler.settotalmass > 0:
+        raise UsageError(f"{path}: settotalmass and mocap bodies exclude each other; give each body its mass")
     for keyframe in list(spec.keys):  # which have no positions of the new joints
         spec.delete(keyframe)
     for body in mocap:

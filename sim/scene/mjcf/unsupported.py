@@ -50,6 +50,8 @@ def apply_disable_flags(model: Any) -> None:
             for field in fields:
                 if hasattr(model, field):
                     getattr(model, field)[:] = 0
+    if flags & _bit("SPRING") and flags & _bit("DAMPER"):  # then MuJoCo computes no passive forces
+        model.body_gravcomp[:] = 0
     if flags & _bit("GRAVITY"):
         model.opt.gravity[:] = 0
 

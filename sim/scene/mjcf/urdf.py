@@ -31,10 +31,13 @@ def read_urdf(path: Path) -> ElementTree.Element | None:
         root = ElementTree.parse(path).getroot()
     except (ElementTree.ParseError, OSError):
         return None
-    if root.tag != "robot":
+    if root.tag.rpartition("}")[2] != "robot":
         return None
     if any("xacro" in str(element.tag) for element in root.iter()):
         raise UsageError(f"{path}: has xacro macros, which are not expanded; run xacro and load its output")
+    for element in root.iter():  # a namespace is a part of the tags here; MuJoCo does not know namespaces
+        if isinstance(element.tag, str):
+            element.tag = element.tag.rpartition("}")[2]
     _mimic_joints(root, path)  # its errors are clearer than those of MuJoCo's parser
     _check_floating(root, path)
     return root
@@ -50,9 +53,38 @@ def _check_floating(robot: ElementTree.Element, path: Path) -> None:
             raise UsageError(f"{path}: joint {name!r} is floating, so its parent must be called 'world', got {link!r}")
 
 
-def complete_urdf(spec: Any, robot: ElementTree.Element, path: Path) -> None:
-    """Resolve mesh files, repair inertia and add motors in a parsed URDF file (mujoco.MjSpec)."""
+def parse_urdf(robot: ElementTree.Element, path: Path) -> Any:
+    """The file as a mujoco.MjSpec, with mesh files resolved, inertia repaired and motors added.
+
+    MuJoCo names a mesh by its file name and takes two files of one name in different folders for one mesh. All but the
+    first are therefore read under another name.
+    """
+    addresses: dict[str, str] = {}  # by the name that MuJoCo reads
+    stems: dict[str, str] = {}
+    for mesh in robot.iter("mesh"):
+        address = mesh.get("filename", "")
+        stem, suffix = Path(address).stem, Path(address).suffix
+        alias = address
+        while stems.setdefault(stem, address) != address:
+            stem += "_"
+            alias = stem + suffix
+        mesh.set("filename", alias)
+        addresses[alias] = address
+    if all(alias == address for alias, address in addresses.items()):
+        spec = mujoco.MjSpec.from_file(str(path))
+    else:
+        spec = mujoco.MjSpec.from_string(ElementTree.tostring(robot, encoding="unicode"))
+        spec.modelfiledir = str(path.parent)
+    for mesh in spec.meshes:
+        mesh.file = addresses.get(mesh.file, mesh.file)
+    _complete(spec, robot, path)
+    return spec
+
+
+def _complete(spec: Any, robot: ElementTree.Element, path: Path) -> None:
     spec.compiler.fusestatic = False  # keep the link frames: a pad may refer to them as sites
+    if spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO:
+        spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE  # URDF has no densities
     for mesh in spec.meshes:
         mesh.file = _mesh_file(mesh.file, path)
         if Path(mesh.file).suffix.lower() == ".dae" and (path.parent / mesh.file).is_file():
@@ -63,7 +95,7 @@ def complete_urdf(spec: Any, robot: ElementTree.Element, path: Path) -> None:
     _correct_ranges(spec, robot, path)
     mimics = _mimic_joints(robot, path)
     _couple(spec, mimics)
-    _add_motors(spec, robot, without=mimics)
+    _add_motors(spec, robot, path, without=mimics)
 
 
 def compile_urdf(spec: Any, path: Path) -> Any:
@@ -83,7 +115,10 @@ def compile_urdf(spec: Any, path: Path) -> Any:
     moving = [i for i in np.flatnonzero(bounded) if model.body_dofnum[i] > 0]
     for i in moving:
         if model.body_subtreemass[i] <= _LEAST_MASS * model.nbody:
-            raise UsageError(f"{path}: link {model.body(i).name!r} moves without any mass; give it an <inertial>")
+            raise UsageError(
+                f"{path}: link {model.body(i).name!r} moves without any mass; give it an <inertial>, or the file "
+                '<mujoco><compiler inertiafromgeom="true"/></mujoco> for 1000 kg/m³ in its collision geometry'
+            )
     names = ", ".join(model.body(i).name for i in moving)
     warnings.warn(
         f"{path.name}: moving links without mass or without inertia: {names}; simulated with at least "
@@ -227,17 +262,20 @@ def _text(values: NDArray[np.float64]) -> str:
     return ", ".join(f"{value:.4g}" for value in values)
 
 
-def _add_motors(spec: Any, robot: ElementTree.Element, without: Container[str]) -> None:
+def _add_motors(spec: Any, robot: ElementTree.Element, path: Path, without: Container[str]) -> None:
     """Add a motor for each joint of a <transmission> or <ros2_control>, or for all joints if the file has neither.
 
-    Joints of `without` follow others and have no motor of their own.
-
-    The control is the joint force, as in the effort interface of ROS, within the effort limit of the joint.
+    Joints of `without` follow others and have no motor of their own. The control is the joint force, as in the effort
+    interface of ROS, within the effort limit of the joint. Raises UsageError for a joint that the file does not have.
     """
     driven = _driven_joints(robot)
+    all_joints = next(robot.iter("transmission"), None) is None and next(robot.iter("ros2_control"), None) is None
+    names = {joint.get("name", "") for joint in robot.findall("joint")}
+    if unknown := sorted(driven.keys() - names):
+        raise UsageError(f"{path}: a motor drives joint {unknown[0]!r}, which the file does not have")
     scalar_types = (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE)
     for joint in spec.joints:
-        if joint.type in scalar_types and joint.name not in without and (not driven or joint.name in driven):
+        if joint.type in scalar_types and joint.name not in without and (all_joints or joint.name in driven):
             name = driven.get(joint.name, joint.name)
             spec.add_actuator(name=name, trntype=mujoco.mjtTrn.mjTRN_JOINT, target=joint.name)
 

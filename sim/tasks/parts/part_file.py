@@ -239,13 +239,12 @@ def _misalignment(table: TomlTable) -> tuple[float, float, float]:
 
 
 def _find(part: str | Path) -> Path:
-    path = Path(part)
+    path, names = Path(part), part_names()
+    if part in names:  # even if the working directory has a file of this name
+        return Path(str(_folder())) / f"{part}.toml"
     if path.suffix == ".toml" or path.is_file():
         return path
-    shipped = Path(str(_folder())) / f"{part}.toml"
-    if not shipped.is_file():
-        raise UsageError(f"no part {str(part)!r}; {suggestion(str(part), part_names())} (or give a .toml file)")
-    return shipped
+    raise UsageError(f"no part {str(part)!r}; {suggestion(str(part), names)} (or give a .toml file)")
 
 
 def _folder() -> Traversable:

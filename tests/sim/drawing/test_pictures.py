@@ -155,3 +155,16 @@ def test_wrong_arguments_are_refused(arguments: dict[str, object], message: str)
 def test_wrong_camera_is_refused() -> None:
     with pytest.raises(UsageError, match="distance must be above 0"):
         gs.Camera((0.0, 0.0, 0.0), -1.0)
+
+
+def test_picture_shows_a_shape_that_was_rotated_on_its_body() -> None:
+    sim = gs.Simulator(gs.load_scene("pushing"))
+    before = gs.render(sim)
+    sim.param("box.shape.turn.z")[:] = 0.6
+    assert (gs.render(sim) != before).sum() > 1000
+
+
+def test_cameras_of_wrong_types_are_refused() -> None:
+    for target in (0.1, ("a", 0, 0), (0.0, 0.0)):
+        with pytest.raises(UsageError, match="camera"):
+            gs.Camera(target, 1.0)  # type: ignore[arg-type]

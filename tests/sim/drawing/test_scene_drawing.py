@@ -90,3 +90,10 @@ def test_a_contact_of_a_larger_box_is_drawn_where_its_force_acts() -> None:
 def test_scenes_and_readings_are_compared_by_identity() -> None:
     scene = gs.load_scene("rolling")
     assert scene != gs.load_scene("rolling") and scene in {scene}
+
+
+def test_markers_are_where_the_parameters_of_their_pad_put_them() -> None:
+    sim = gs.Simulator(gs.load_scene("rolling", overrides={"pads.pad.rows": 3, "pads.pad.cols": 3}))
+    before = scene_drawing(sim).pads[0].positions
+    sim.param("pad.markers.pos.x")[:] += 0.01
+    np.testing.assert_allclose(scene_drawing(sim).pads[0].positions - before, [[0.01, 0, 0]] * 9, atol=1e-12)

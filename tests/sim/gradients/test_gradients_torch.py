@@ -1,5 +1,6 @@
 """Gradients through PyTorch: over a hundred steps, step by step, and with respect to fitted parameters."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -181,3 +182,35 @@ def test_gradient_by_a_quaternion_of_any_length(length: float) -> None:
     (gradient,) = torch.autograd.grad(orientation(start), start)
     differences = [orientation(start.detach() + d) - orientation(start.detach() - d) for d in 1e-6 * torch.eye(4)]
     np.testing.assert_allclose(gradient, torch.stack(differences) / 2e-6, atol=1e-8)
+
+
+def test_forces_do_not_depend_on_the_length_of_a_quaternion() -> None:
+    """Before the first step too, and with the gradient of a site's pose."""
+    sim = Simulator(load_scene("grasp"), num_envs=2)
+    first = sim.joint_q("bar") + 3
+    sim.q[1, first : first + 4] *= 1.2
+    for values in (sim.tactile(), sim.wrenches(), sim.site_poses(), sim.poses()):
+        np.testing.assert_allclose(values[0], values[1], rtol=1e-12, atol=1e-12)
+
+
+def test_threads_on_one_simulator_are_refused_and_change_no_parameters() -> None:
+    sim = Simulator(load_scene("pushing"), num_envs=16, threads=1)
+    state, u = torch_layer.torch_state(sim), torch.zeros((5, 16, sim.model.nu), dtype=torch.float64)
+    u[:, :, sim.scene.u("box_x")] = 2
+
+    def end(mass: float) -> torch.Tensor:
+        params = {"box.mass": torch.tensor(mass, dtype=torch.float64)}
+        return torch_layer.torch_rollout(sim, state, u, params=params).q[-1]
+
+    masses, mass = (0.2, 0.3), float(sim.param("box.mass")[0])
+    expected = [end(mass) for mass in masses]
+    refused = 0
+    with ThreadPoolExecutor(2) as pool:
+        jobs = [(k, pool.submit(end, masses[k])) for k in [0, 1] * 100]
+        for k, job in jobs:
+            try:
+                assert torch.equal(job.result(), expected[k])
+            except UsageError as error:
+                assert "busy" in str(error)
+                refused += 1
+    assert refused < 200 and (sim.param("box.mass") == mass).all()

@@ -151,3 +151,17 @@ def test_what_is_refused(tmp_path: Path) -> None:
     limited = ARM.replace('name="pan"', 'name="pan" actuatorgravcomp="true" actuatorfrcrange="-1 1"')
     with pytest.raises(UsageError, match="actuatorgravcomp of joint 'pan' with an actuatorfrcrange is not supported"):
         load(tmp_path, limited)
+
+
+def test_disabled_springs_and_dampers_disable_the_compensation_too(tmp_path: Path) -> None:
+    """MuJoCo computes no passive forces then."""
+    for flags, compensated in (('spring="disable"', True), ('spring="disable" damper="disable"', False)):
+        text = ARM.replace('<option gravity="0.5 -0.3 -9.8"/>', f"<option><flag {flags}/></option>")
+        (tmp_path / "arm.xml").write_text(text)
+        model = mujoco.MjModel.from_xml_string(text)
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        sim = Simulator(load_scene(tmp_path / "arm.xml", overrides={"step": 1e-5}))
+        sim.step(np.zeros(sim.model.nu))
+        np.testing.assert_allclose(sim.v[0] / 1e-5, data.qacc, rtol=2e-3, atol=1e-3)
+        assert bool(np.abs(data.qfrc_gravcomp).max() > 0) == compensated

@@ -153,9 +153,9 @@ def write(folder: Path, files: dict[str, str]) -> Path:
     return folder
 
 
-def write_stl(path: Path) -> None:
-    """A tetrahedron of 0.1 m."""
-    corners = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]])
+def write_stl(path: Path, size: float = 0.1) -> None:
+    """A tetrahedron."""
+    corners = size * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
     faces = np.zeros(4, np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("color", "<u2")]))
     faces["corners"] = corners[[[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]]
     path.parent.mkdir(parents=True, exist_ok=True)

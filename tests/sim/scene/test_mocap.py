@@ -111,3 +111,10 @@ def test_gradients(law: str, integrator: str, tmp_path: Path) -> None:
         assert gradient_check.compare_to_dual_numbers(case, rng, directions=2).error < 1e-10
         agreement = gradient_check.compare_to_differences(case, params=False)
         assert agreement.error < 1e-6 and agreement.skipped <= 0.05
+
+
+def test_total_mass_beside_a_mocap_body_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "mocap.xml"
+    path.write_text(MODEL.replace("<mujoco>", '<mujoco><compiler settotalmass="2"/>'))
+    with pytest.raises(UsageError, match=r"mocap\.xml: settotalmass and mocap bodies exclude each other"):
+        load_scene(path)

@@ -55,6 +55,38 @@ def test_mesh_is_found(address: str, file: str, tmp_path: Path, monkeypatch: pyt
     assert [j.name for j in scene.joints] == ["ja", "jb"]
 
 
+def test_meshes_of_one_file_name_in_two_folders_are_two(tmp_path: Path) -> None:
+    """Robots from two packages have a base.stl each; MuJoCo would use one of them for both."""
+    write_stl(tmp_path / "arm/base.stl", 0.1)
+    write_stl(tmp_path / "gripper/base.stl", 0.3)
+    path = robot(tmp_path / "arm.urdf", mesh="arm/base.stl")
+    hand = LINK.format(name="c", ixx=0.02, geometry=MESH.format("package://gripper/base.stl"))
+    joint = JOINT.format(name="jc", parent="b", child="c")
+    path.write_text(path.read_text().replace("</robot>", f"{hand}{joint}</robot>"))
+    meshes = [geom.mesh for geom in load_scene(path).geoms]
+    assert [round(float(np.ptp(mesh.vertices, axis=0).max()), 3) for mesh in meshes if mesh] == [
+        pytest.approx(size, rel=0.5) for size in (0.1, 0.3)
+    ]
+
+
+def test_default_namespace_changes_nothing(tmp_path: Path) -> None:
+    path = robot(tmp_path / "arm.urdf")
+    path.write_text(path.read_text().replace("<robot", '<robot xmlns="http://drake.mit.edu"'))
+    assert [a.name for a in load_scene(path).actuators] == ["ja", "jb"]
+
+
+def test_collision_geometry_gives_no_mass_unless_the_file_asks_for_it(tmp_path: Path) -> None:
+    path = robot(tmp_path / "arm.urdf")
+    box = '<collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision>'
+    last = f'<link name="c">{box}</link>' + JOINT.format(name="jc", parent="b", child="c")
+    path.write_text(path.read_text().replace("</robot>", f"{last}</robot>"))
+    with pytest.raises(UsageError, match="link 'c' moves without any mass; give it an <inertial>, or"):
+        load_scene(path)
+    wanted = '<mujoco><compiler inertiafromgeom="true"/></mujoco></robot>'
+    path.write_text(path.read_text().replace("</robot>", wanted))
+    assert load_scene(path).bodies[-1].mass == pytest.approx(1.0)
+
+
 def test_missing_mesh_is_named(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"no file package://arm/link\.stl"):
         load_scene(robot(tmp_path / "arm.urdf", mesh="package://arm/link.stl"))
@@ -153,6 +185,17 @@ def test_joints_of_a_transmission_have_actuators_of_their_own(actuators: str, na
     scene = load_scene(robot(tmp_path / "arm.urdf", more=TRANSMISSION.format(actuators)))
     assert [a.name for a in scene.actuators] == names
     assert Simulator(scene).model.nu == 2
+
+
+def test_control_that_only_measures_has_no_motor(tmp_path: Path) -> None:
+    control = '<ros2_control><joint name="ja"><state_interface name="position"/></joint></ros2_control>'
+    assert not load_scene(robot(tmp_path / "arm.urdf", more=control)).actuators
+
+
+def test_motor_of_an_unknown_joint_is_refused(tmp_path: Path) -> None:
+    motor = '<transmission name="t"><joint name="jx"/></transmission>'
+    with pytest.raises(UsageError, match=r"arm\.urdf: a motor drives joint 'jx', which the file does not have"):
+        load_scene(robot(tmp_path / "arm.urdf", more=motor))
 
 
 def test_continuous_joint_has_no_range(tmp_path: Path) -> None:

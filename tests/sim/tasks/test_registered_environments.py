@@ -119,3 +119,23 @@ def test_every_task_has_its_tables_and_an_oracle_or_none(task: str) -> None:
         batch.step(np.zeros((2, *batch.action_space.shape)), rng)
         assert np.isfinite(batch.observation).all() and batch.info["privileged"].shape[0] == 2
         assert batch.description.digest() == type(batch.description).from_json(batch.description.to_json()).digest()
+
+
+def test_wrong_tables_and_negative_levels_are_errors() -> None:
+    for options, message in (
+        ({"ranges": "x"}, "ranges must be a mapping"),
+        ({"samples": [1]}, "samples must be a mapping"),
+        ({"foo": 1}, "no option 'foo'"),
+    ):
+        for name in ("grasp", "insertion"):
+            with pytest.raises(UsageError, match=message):
+                make_task(name, 1, **options)
+    batch = make_task("insertion", 1, preset="fast", threads=1, ranges={"gel_creep": (-1, -0.5)})
+    with pytest.raises(UsageError, match="gel_creep must not be negative"):
+        batch.reset(batch.all, np.random.default_rng(0))
+
+
+def test_gel_without_delay_creeps_at_once() -> None:
+    batch = make_task("insertion", 1, preset="fast", threads=1, ranges={"gel_time": 0, "gel_creep": 0.2})
+    batch.reset(batch.all, np.random.default_rng(0))
+    assert np.isfinite(batch.observation).all()

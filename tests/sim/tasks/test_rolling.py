@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from gelflow.errors import UsageError
+from gelflow.observation import Grid
 from gelflow.sim.tasks.rolling import FULL_RANDOMIZATION, Rolling, RollingTask
 
 
@@ -69,3 +70,10 @@ def test_picture_of_the_ball_and_its_goal() -> None:
     batch = Rolling(1, threads=1)
     batch.reset(batch.all, np.random.default_rng(0))
     assert len(np.unique(batch.render(0).reshape(-1, 3), axis=0)) > 50
+
+
+def test_center_of_the_grid_is_that_of_the_description() -> None:
+    task = RollingTask(grid=Grid(rows=3, cols=3, pitch=4.0, center=(3.0, 1.0)))
+    (pad,) = Rolling(1, task=task, threads=1).sim.scene.pads
+    center = ((pad.positions - pad.pose.position) @ pad.pose.matrix()).mean(0)
+    np.testing.assert_allclose(center, [3e-3, 1e-3, 0], atol=1e-12)
