@@ -3,7 +3,6 @@
 `gelflow.observation.flow_map` computes the observation of a policy from these frames.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -245,11 +244,17 @@ def decode_image(data: bytes, *, reduce: Reduction = 1) -> Image:
 
 
 def reduce_image(image: Image, reduce: Reduction) -> Image:
-    """`image` at 1 / `reduce` of its size, rounded up, by averaging."""
+    """`image` at 1 / `reduce` of its size, rounded up, by averaging.
+
+    Sizes that are no multiple of `reduce` are first continued by their last pixels, as JPEG decoders do: a scaling to
+    the rounded size would displace markers by up to a pixel.
+    """
     if reduce == 1:
         return image
-    height, width = image.shape[:2]
-    size = (math.ceil(width / reduce), math.ceil(height / reduce))
+    below, right = (-size % reduce for size in image.shape[:2])
+    if below or right:
+        image = np.asarray(cv2.copyMakeBorder(image, 0, below, 0, right, cv2.BORDER_REPLICATE), dtype=np.uint8)
+    size = (image.shape[1] // reduce, image.shape[0] // reduce)
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 

@@ -9,6 +9,7 @@ give bit-identical results.
 """
 
 from dataclasses import dataclass
+from typing import get_args
 
 import cv2
 import numpy as np
@@ -28,7 +29,7 @@ _MAX_FINE_RADIUS = 12.5  # of a dot [px] in the image in which dots are fitted a
 
 @dataclass(frozen=True)
 class TrackerConfig:
-    """Prior knowledge of the markers."""
+    """Prior knowledge of the markers. Raises UsageError for an unknown polarity."""
 
     rows: int | None = None  # rows of markers in the image; None: detected
     cols: int | None = None  # markers in a row; None: detected
@@ -37,6 +38,10 @@ class TrackerConfig:
     # Of a partly visible grid, `rows` and `cols` being the visible ones; see `GridRequest`.
     skipped: tuple[int, int, int, int] = (0, 0, 0, 0)
     anchor: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        if self.polarity not in get_args(Polarity):
+            raise UsageError(f"polarity must be one of {', '.join(get_args(Polarity))}, got {self.polarity!r}")
 
 
 @dataclass(frozen=True)

@@ -115,7 +115,7 @@ class Imitation(Learner):
         mine = self._description.to_json()
         different = task_differences(_without_part(checkpoint.task), _without_part(mine))
         if different or checkpoint.architecture != self._architecture:
-            layers = f"{checkpoint.architecture.to_json()} (here {self._architecture.to_json()})"
+            layers = task_differences(checkpoint.architecture.to_json(), self._architecture.to_json())
             raise UsageError(f"training cannot start from a policy with other {different or layers}")
         tensors = checkpoint.tensors
         checkpoint.architecture.network(self._description, tensors)  # checks names, shapes and values

@@ -17,6 +17,7 @@ from gelflow.policies.networks.mlp import MLP
 from gelflow.policies.networks.polynomial_mlp import PolynomialMLP
 from gelflow.policies.ppo import PPO, PPOSettings
 from gelflow.policies.training.learner import Learner
+from gelflow.policies.training.progress_log import table_columns
 from gelflow.policies.training.run import POLICY, Progress, RunSettings, TrainingResult, TrainingRun
 from gelflow.sim.tasks.cap_rotation import CapRotationTask
 from gelflow.sim.tasks.differentiable_pushing import DifferentiablePushing
@@ -47,9 +48,14 @@ class Recipe:
     best_by: str = "success"  # which evaluation is the best, see `RunSettings`
     policy_name: str = POLICY  # of the checkpoint
 
+    @property
+    def curve_columns(self) -> tuple[str, ...]:
+        """Columns of the learning curve, over the steps."""
+        return table_columns(_LEARNERS[self.algorithm].columns)[1:]
+
     def make_task(self, envs: int | None = None, **options: Any) -> TaskBatch:
         """A batch of environments of the recipe; `options` are those of the task."""
-        return make_task(self.task, envs or self.envs, **{"threads": 1, **self.options, **options})
+        return make_task(self.task, self.envs if envs is None else envs, **{"threads": 1, **self.options, **options})
 
     def make_learner(self, task: TaskBatch, *, seed: int, steps: int) -> Learner:
         """The learner on `task`; `steps` is the length of the whole training."""
@@ -63,6 +69,9 @@ class Recipe:
         if (preset := self.options.get("preset")) is not None:
             values["preset"] = preset
         return values
+
+
+_LEARNERS: dict[str, type[Learner]] = {"ppo": PPO, "backpropagation": Backpropagation, "imitation": Imitation}
 
 
 def actor_for(task: TaskBatch, settings: Mapping[str, Any]) -> ActorArchitecture:

@@ -30,6 +30,7 @@ class TrackingSummary:
     first: TrackingResult | None = None
     pixels_per_mm: float | None = None  # uniform scale, where it is known and there is no calibration
     largest_normal: ForceEstimate | None = None  # the forces of the image with the largest normal force
+    largest_normal_at: str = ""  # this image
     slip: SlipSummary = field(default_factory=SlipSummary)
     visible: list[VisiblePart] = field(default_factory=list)  # possible visible parts of a partly visible grid
     _valid: list[float] = field(default_factory=list)  # share of each image
@@ -54,7 +55,7 @@ class TrackingSummary:
         self.slip.add(step)
         force, largest = step.force, self.largest_normal
         if force is not None and (largest is None or force.normal > largest.normal):
-            self.largest_normal = force
+            self.largest_normal, self.largest_normal_at = force, step.frame.name
         length = np.nan_to_num(np.linalg.norm(measured, axis=1), nan=-1.0)
         marker = int(length.argmax())
         if length[marker] > self.largest:
@@ -99,6 +100,7 @@ class TrackingSummary:
             "largest_displacement_mm": self.largest_mm,
             "largest_displacement_at": self.largest_at,
             "force": None if self.largest_normal is None else force_record(self.largest_normal),
+            "force_at": None if self.largest_normal is None else self.largest_normal_at,
             "slip": self.slip.to_json() if self.largest_normal is not None else None,
             "seconds_per_image": self.frame_seconds(),
             "seconds_first_image": self.seconds[0],

@@ -72,8 +72,8 @@ def read_curves(runs: Sequence[Run], records: Mapping[str, RunRecord], column: s
     first = next(iter(tables.values()))
     x_name = next(iter(first))
     names = [name for name in first if name != x_name]
-    if column is not None and column not in names:
-        raise UsageError(f"learning curves have no column {column!r}; {suggestion(column, names)}")
+    if column is not None:
+        check_column(column, names)
     candidates = [name for name in (*PREFERRED, *names) if name in names]
     y_name = column or next((name for name in candidates if np.isfinite(first[name]).any()), names[0])
     found = []
@@ -83,6 +83,12 @@ def read_curves(runs: Sequence[Run], records: Mapping[str, RunRecord], column: s
         if pairs:
             found.append(combine(values, pairs))
     return Curves(x_name, y_name, found) if found else None
+
+
+def check_column(column: str, names: Sequence[str], location: str = "") -> None:
+    """Raises UsageError when `column` is not one of those of the learning curves; `location` starts its message."""
+    if column not in names:
+        raise UsageError(f"{location}learning curves have no column {column!r}; {suggestion(column, names)}")
 
 
 def draw(path: Path, curves: Curves, task: str) -> None:

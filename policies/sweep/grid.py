@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from gelflow.errors import UsageError
+from gelflow.policies.sweep.curves import check_column
 from gelflow.policies.sweep.engines.slurm import SlurmSettings
 from gelflow.policies.sweep.run import GELFLOW, Run
 from gelflow.toml_tables import TomlTable, read_toml
@@ -22,10 +23,11 @@ _LONGEST_NAME = 100  # characters; file systems permit 255 bytes with all suffix
 class CommandOptions:
     """The options of `gelflow train` that a grid file may have."""
 
-    names: Collection[str]  # without the leading dashes
+    names: Mapping[str, str]  # without the leading dashes → the value that the option sets, which may have two names
     flags: Collection[str]  # of these, the ones without a value
     reserved: Mapping[str, str]  # options that the sweep itself gives, with the reason
     check: Callable[[Sequence[str]], None]  # raises UsageError for arguments that the command refuses
+    curve_columns: Callable[[Sequence[str]], Sequence[str]]  # of the learning curve of a run with these arguments
 
 
 @dataclass(frozen=True)
@@ -86,9 +88,7 @@ def read_grid(path: Path, command: CommandOptions) -> Grid:
             if key in command.reserved:
                 raise UsageError(f"{part.location}: {key!r} does not belong here; {command.reserved[key]}")
         part.check_keys(command.names)
-    both = sorted(set(options.data) & set(grid.data))
-    if both:
-        raise UsageError(f"{path}: {both[0]!r} is in [options] and in [grid]; keep one of them")
+    _check_once(path, options, grid, command.names)
     for part, values in [(options, [*options.data.items()]), (grid, _members(grid))]:
         for key, value in values:
             _check_value(part, key, value, flag=key in command.flags)
@@ -108,7 +108,20 @@ def read_grid(path: Path, command: CommandOptions) -> Grid:
             command.check(run.arguments[1:])
         except UsageError as error:
             raise UsageError(f"{path}: {error}") from None
+        if read.curve is not None:
+            check_column(read.curve, command.curve_columns(run.arguments[1:]), f"{path}: ")
     return read
+
+
+def _check_once(path: Path, options: TomlTable, grid: TomlTable, names: Mapping[str, str]) -> None:
+    """Raises UsageError for an option that is given twice, in both tables or by two names."""
+    used: dict[str, str] = {}
+    for key in (*options.data, *grid.data):
+        first = used.setdefault(names[key], key)
+        if key in options.data and key in grid.data:
+            raise UsageError(f"{path}: {key!r} is in [options] and in [grid]; keep one of them")
+        if first != key:
+            raise UsageError(f"{path}: {first!r} and {key!r} are one option; keep one of them")
 
 
 def _seeds(table: TomlTable) -> tuple[int, ...]:

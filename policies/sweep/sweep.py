@@ -15,6 +15,7 @@ from gelflow.policies.sweep.run import Run, RunRecord, read_record, write_record
 from gelflow.policies.training.folder import try_lock
 
 GRID = "grid.toml"  # copy of the grid file in the folder of a sweep
+RESULTS = ("runs.csv", "summary.csv", "curves.csv", "curves.png")  # of `gelflow sweep`, beside it
 Report = Callable[[Run, RunRecord, bool], None]  # a run that ended, its record, and whether it is started again
 
 
@@ -47,12 +48,13 @@ def store_grid_file(folder: Path, grid_file: Path) -> None:
 
 
 def check_grid_file(folder: Path, grid_file: Path, runs: Sequence[Run]) -> None:
-    """Raises UsageError where storing the grid would replace another file, in a folder without any of the runs."""
+    """Raises UsageError where the sweep would replace files of another one, in a folder without any of the runs."""
     stored = folder / GRID
-    if not stored.exists() or stored.read_bytes() == grid_file.read_bytes():
+    if any(run.record.exists() for run in runs) or (stored.exists() and stored.read_bytes() == grid_file.read_bytes()):
         return
-    if not any(run.record.exists() for run in runs):
-        raise UsageError(f"{stored} is not of these runs; choose another folder or delete it")
+    for file in (folder / name for name in (GRID, *RESULTS)):
+        if file.exists():
+            raise UsageError(f"{file} is not of these runs; choose another folder or delete it")
 
 
 def incomplete(runs: Sequence[Run]) -> list[Run]:

@@ -16,11 +16,16 @@ _TIMES = ("steps", "minutes", "simulation_s", "learning_s", "evaluation_s")
 EVALUATION = ("evaluated_success", "success_low", "success_high", "evaluated_length", "evaluated_reward")
 
 
+def table_columns(columns: Sequence[str]) -> tuple[str, ...]:
+    """The columns of the table of a learner with these `columns`; the first one counts the steps."""
+    return (*_TIMES, *columns, *EVALUATION)
+
+
 class ProgressLog:
     """The files in the folder of a run. Rows beyond `steps`, of an interrupted interval, are dropped."""
 
     def __init__(self, folder: Path, columns: Sequence[str], steps: int) -> None:
-        self._columns = (*_TIMES, *columns, *EVALUATION)
+        self._columns = table_columns(columns)
         kept = [row for row in read_table(folder / TABLE) if float(row["steps"]) <= steps] if steps else []
         table = io.StringIO(newline="")
         writer = csv.DictWriter(table, self._columns)

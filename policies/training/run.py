@@ -137,7 +137,7 @@ class TrainingRun:
 
         The result of a finished run of the same configuration is read from the folder: a command whose output was lost
         can be repeated. Raises UsageError when the folder cannot be written, is in use, or holds a run of another
-        configuration or a policy of another origin.
+        configuration, files of another origin, or no longer the best policy of this unfinished run.
         """
         torch.set_num_threads(1)  # small matrices; one thread makes a run repeatable
         with locked(self.folder):
@@ -214,17 +214,27 @@ class TrainingRun:
             raise UsageError(f"{self.folder} already holds a trained policy; choose another folder or delete it")
         if stored:
             self._check_same(stored)
-        elif (self.folder / PROGRESS).exists():
-            raise UsageError(f"{self.folder / PROGRESS} is not of a run; choose another folder or delete it")
         else:
+            for file in (self.folder / name for name in (PROGRESS, STATE, PICTURE, TENSORBOARD)):
+                if file.exists():
+                    raise UsageError(f"{file} is not of a run; choose another folder or delete it")
             self._write_configuration()
         if (self.folder / STATE).exists():
+            self._check_checkpoint()  # an evaluation precedes each state
             state = load_state(self.folder / STATE)
             self.learner.load(state)
             self.learner.clock.seconds.update(state.values["run"]["shares"])
             self._seconds = state.values["run"]["seconds"]
             self._best = EvaluationResult(**state.values["run"]["best"])
             self.learner.restart_episodes()
+
+    def _check_checkpoint(self) -> None:
+        """Raises UsageError when the best policy of the evaluations so far is not in the folder."""
+        if not self.checkpoint.exists():
+            raise UsageError(
+                f"{self.checkpoint}, the best policy of this unfinished run, is missing: put it back, or delete the "
+                "folder"
+            )
 
     def _check_same(self, stored: Mapping[str, Any]) -> None:
         configuration = json.loads(json.dumps(self._configuration()))
@@ -259,6 +269,7 @@ class TrainingRun:
     def _finish(self, start: float) -> TrainingResult:
         """Draws the learning curve and marks the run as finished."""
         assert self._best is not None
+        self._check_checkpoint()
         progress_curve.draw(self.folder / PICTURE, self.folder / PROGRESS, title=self.learner.task.description.name)
         numbers: dict[str, Any] = {"steps": self.learner.steps, "minutes": self._minutes(start)}
         numbers["seconds"] = dict(self.learner.clock.seconds)
@@ -284,7 +295,7 @@ def locked(folder: Path) -> Iterator[None]:
     file: IO[str]
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        file = (folder / "lock").open("w")
+        file = (folder / "lock").open("a")  # keeps the contents of a file that is not of a run
     except OSError as error:
         raise UsageError(f"cannot write into {folder}: {error.strerror}") from error
     with file:

@@ -259,6 +259,11 @@ def test_unreadable_images_are_skipped_and_shown(tmp_path: Path, capsys: pytest.
         (["--sensor", "middle"], "sensor must be left or right"),
         (["--rate", "0"], "rate must be"),
         (["--images", "0"], "--images must be at least 1"),
+        (["--magnify", "inf"], "--magnify must be above 0 and at most 1e+06, got inf"),
+        (["--magnify", "nan"], "--magnify must be above 0 and at most 1e+06, got nan"),
+        (["--pixels-per-mm", "1e-9"], "a scale of 1e-09 px/mm is impossible for markers 34."),
+        (["--pixels-per-mm", "1e9"], "must be within 0.01 to 1000 mm; correct --pixels-per-mm"),
+        (["--pixels-per-mm", "20", "--profile", "mine.toml"], "pitch of the profile is 2.2 mm: --pixels-per-mm 15."),
     ],
 )
 def test_wrong_options_are_errors(
@@ -271,6 +276,7 @@ def test_wrong_options_are_errors(
     monkeypatch.chdir(tmp_path)
     draw(Path("images"), 1)
     Path("notes.csv").write_text("mine")
+    Path("mine.toml").write_text('format = 1\ntitle = "mine"\n[markers]\npitch_mm = 2.2\n')
     if "other.json" in options:
         Path("big.jpg").write_bytes(FastGelRenderer().encode(FastGelRenderer().render(np.zeros((252, 2)))))
         assert main(["calibrate-camera", "big.jpg", "--spacing-mm", "1.4", "--out", "other.json"]) == 0

@@ -55,7 +55,7 @@ def test_forces_are_written_everywhere(
     scale = ["--pixels-per-mm", str(LOOK.pixels_per_mm), "--gel", str(images / "gel.toml")]
     assert main(["track", str(images / "images"), *scale, *outputs, "--json"]) == 0
     summary = json.loads(capsys.readouterr().out)
-    assert summary["force"]["normal"] == pytest.approx(pressed.normal, rel=0.1)
+    assert summary["force"]["normal"] == pytest.approx(pressed.normal, rel=0.1) and summary["force_at"] == "5.jpg"
     with files[0].open(newline="") as text:
         rows = list(csv.DictReader(text))
     assert [row["contact"] for row in rows] == ["0", "0", "1", "1", "1", "1"]
@@ -69,6 +69,29 @@ def test_forces_are_written_everywhere(
     assert [value["contact"] for value in recorded] == [False, False, True, True, True, True]
     assert recorded[-1]["normal"] == pytest.approx(float(rows[-1]["normal_n"]), abs=1e-4)
     assert cv2.imread(str(files[2])) is not None
+
+
+def test_the_scale_is_in_pixels_of_the_image_as_the_camera_sends_it(
+    images: Path, pressed: PressedGel, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "half.toml").write_text('format = 1\ntitle = "half"\n[image]\nreduce = 2\n[markers]\npitch_mm = 1.4\n')
+    words = ["track", str(images / "images"), "--profile", str(tmp_path / "half.toml")]
+    words += ["--gel", str(images / "gel.toml"), "--pixels-per-mm"]
+    assert main([*words, str(LOOK.pixels_per_mm)]) == 0
+    told = " ".join(capsys.readouterr().out.split())
+    assert f"{LOOK.pixels_per_mm / 2:.2f} px/mm everywhere in images at 1/2 of their size" in told and "(5.jpg)" in told
+    assert main([*words, str(LOOK.pixels_per_mm), "--json"]) == 0
+    force = json.loads(capsys.readouterr().out)["force"]
+    assert force["normal"] == pytest.approx(pressed.normal, rel=0.15)
+    assert main([*words, str(LOOK.pixels_per_mm / 2)]) == 2
+    assert "but the pitch of the profile is 1.4 mm: --pixels-per-mm" in capsys.readouterr().err
+
+
+def test_markers_far_apart_on_a_thin_gel_give_a_warning(images: Path, tmp_path: Path) -> None:
+    (tmp_path / "thin.toml").write_text(GEL.replace("0.003", "0.001"))
+    words = ["track", str(images / "images"), "--images", "2", "--pixels-per-mm", str(LOOK.pixels_per_mm)]
+    with pytest.warns(UserWarning, match=r"markers 1.4 mm apart .* a gel 1 mm thick: check the scale"):
+        assert main([*words, "--gel", str(tmp_path / "thin.toml")]) == 0
 
 
 @pytest.mark.parametrize("calibrated", [False, True])

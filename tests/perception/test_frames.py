@@ -8,7 +8,7 @@ import pytest
 
 from gelflow.errors import PeerError, UsageError
 from gelflow.perception.camera_calibration import CameraCalibration
-from gelflow.perception.frames import CameraMount, ImageDecoder, decode_image, tactile_frame
+from gelflow.perception.frames import CameraMount, ImageDecoder, Reduction, decode_image, tactile_frame
 from gelflow.perception.synthetic.appearance import GelAppearance
 from gelflow.perception.synthetic.fast_renderer import FastGelRenderer
 from gelflow.perception.tracker import MarkerTracker, TrackingResult
@@ -137,3 +137,16 @@ def test_decoding_is_repeatable() -> None:
     renderer = FastGelRenderer()
     data = renderer.encode(renderer.render(np.zeros((252, 2))))
     assert decode_image(data).shape == (427, 320, 3) and (decode_image(data) == decode_image(data)).all()
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+@pytest.mark.parametrize("reduce", [2, 4, 8])
+def test_a_reduced_image_of_any_size_keeps_positions(reduce: Reduction, suffix: str) -> None:
+    picture = np.zeros((1049, 701), np.uint8)  # no multiples of `reduce`
+    cv2.circle(picture, (660, 1010), 24, 200, cv2.FILLED, cv2.LINE_AA)  # near the border
+    reduced = decode_image(bytes(cv2.imencode(suffix, picture)[1]), reduce=reduce)[..., 0]
+    assert reduced.shape == (-(-1049 // reduce), -(-701 // reduce))
+    weights = np.where(reduced > 20, reduced, 0).astype(float)
+    down, right = (float((weights * at).sum() / weights.sum()) for at in np.indices(reduced.shape))
+    exact = [(at + 0.5) / reduce - 0.5 for at in (660, 1010)]
+    assert [right, down] == pytest.approx(exact, abs=0.02)

@@ -168,6 +168,11 @@ def test_impossible_numbers_of_rows_and_columns_are_rejected(rows: int, cols: in
         MarkerTracker(TrackerConfig(rows=rows, cols=cols)).start(FastGelRenderer().render(np.zeros((252, 2))))
 
 
+def test_an_unknown_polarity_is_rejected() -> None:
+    with pytest.raises(UsageError, match="polarity must be one of auto, dark, bright, got 'black'"):
+        TrackerConfig(polarity="black")  # type: ignore[arg-type]
+
+
 def test_an_image_of_another_size_is_rejected() -> None:
     image = FastGelRenderer().render(np.zeros((252, 2)))
     tracker = MarkerTracker()

@@ -153,6 +153,8 @@ def test_a_checkpoint_of_another_task_or_part_is_refused_in_few_words(
     assert "another task: name 'insertion' (here 'cap'); " in capsys.readouterr().err
     assert main(["eval", "insertion", "--part", str(part)]) == 2
     assert "no policy for part 'a/b'" in capsys.readouterr().err
+    assert main(["train", "insertion", "--part", str(part), "--out", str(tmp_path / "run"), "--start"]) == 2
+    assert "give --start the checkpoint of another part" in capsys.readouterr().err
 
 
 def test_a_training_without_success_has_no_mean_length(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -162,9 +164,11 @@ def test_a_training_without_success_has_no_mean_length(tmp_path: Path, capsys: p
     assert "success 0.0%" in output.out and "nan" not in output.out + output.err
 
 
-def test_fine_tuning_starts_from_the_shipped_policy(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("part", "name"), [([], "insertion"), (["--part", "peg"], "peg")])
+def test_fine_tuning_starts_from_the_shipped_policy_of_the_part(part: list[str], name: str, tmp_path: Path) -> None:
     options = ["--attempts", "64", "--envs", "4", "--out", str(tmp_path / "run")]
-    assert main(["train", "insertion", *options, "--start"]) == 0
+    assert main(["train", "insertion", *part, *options, "--start"]) == 0
     stored = json.loads((tmp_path / "run" / "run.json").read_text())
-    assert stored["configuration"]["start"] == load_checkpoint(default_checkpoint()).digest
-    assert stored["configuration"]["recipe"] == "fine-tuning" and str(default_checkpoint()) in stored["command"]
+    shipped = default_checkpoint().with_name(f"{name}.safetensors")
+    assert stored["configuration"]["start"] == load_checkpoint(shipped).digest
+    assert stored["configuration"]["recipe"] == "fine-tuning" and str(shipped) in stored["command"]

@@ -19,9 +19,10 @@ from gelflow.policies.checkpoint import load_network
 from gelflow.policies.episodes import Episodes, Film, OraclePolicy, RandomPolicy, record_films, run_episodes
 from gelflow.policies.networks.mlp import MLP
 from gelflow.policies.networks.torch_actor import TorchActor
-from gelflow.policies.recipes import RECIPES, recipe_for
+from gelflow.policies.recipes import RECIPES, recipe_for, training_run
 from gelflow.policies.reports.evaluation_report import evaluate_all
 from gelflow.policies.reports.failures import failure_ranges, worst_ranges
+from gelflow.policies.training.progress_log import table_columns
 from gelflow.sim.tasks.gripper.flow_map_noise import FlowMapNoise
 from gelflow.sim.tasks.insertion_environments import Insertion
 from gelflow.sim.tasks.parts import load_part
@@ -258,6 +259,29 @@ def test_failures_are_counted_in_ranges_of_equally_many_episodes() -> None:
     assert [entry.episodes for entry in ranges] == [20] * 5
     assert [entry.failures for entry in ranges] == [0, 0, 0, 10, 20]
     assert worst_ranges(ranges) == ["most failures by mass: 20 of 20 between 800 and 1000 g"]
+
+
+@pytest.mark.parametrize(("count", "rate"), [(200, 0.9), (1000, 0.6)])
+def test_failures_that_depend_on_nothing_are_seldom_ascribed_to_a_quantity(count: int, rate: float) -> None:
+    rng, named, evaluations = np.random.default_rng(0), 0, 100
+    for _ in range(evaluations):
+        success = rng.random(count) < rate
+        table = {f"quantity {i}": rng.random(count) for i in range(15)}
+        episodes = Episodes(success, ~success, np.ones(count, int), np.zeros(count), table)
+        named += bool(worst_ranges(failure_ranges(episodes)))
+    assert named <= 0.1 * evaluations  # with the interval of one range about 70
+
+
+def test_a_training_without_environments_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="num_envs must be at least 1, got 0"):
+        training_run("grasp", tmp_path, envs=0)
+
+
+@pytest.mark.parametrize(("task", "name"), [(task, name) for task in RECIPES for name in RECIPES[task]])
+def test_a_recipe_knows_the_columns_of_its_learning_curve(task: str, name: str) -> None:
+    recipe = recipe_for(task, name)
+    learner = recipe.make_learner(recipe.make_task(2), seed=0, steps=64)
+    assert recipe.curve_columns == table_columns(learner.columns)[1:]
 
 
 def test_every_episode_counts_once_whatever_its_length() -> None:

@@ -168,6 +168,35 @@ def test_a_folder_belongs_to_one_run(tmp_path: Path) -> None:
         make_run(tmp_path / "file").train()
 
 
+@pytest.mark.parametrize("name", ["progress.csv", "state.safetensors", "learning_curve.png", "tensorboard"])
+def test_files_of_another_origin_are_not_continued_or_replaced(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text("mine")
+    (tmp_path / "lock").write_text("mine")
+    with pytest.raises(UsageError, match=rf"{name} is not of a run; choose another folder or delete it"):
+        make_run(tmp_path).train()
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {name: "mine", "lock": "mine"}
+
+
+def test_a_run_does_not_finish_without_its_best_policy(tmp_path: Path) -> None:
+    policy, kept = tmp_path / "policy.safetensors", tmp_path / "kept.safetensors"
+    with pytest.raises(Killed):
+        make_run(tmp_path, report=killed_after(600)).train()
+    policy.rename(kept)
+    with pytest.raises(UsageError, match=r"policy.safetensors, the best .* is missing: put it back, or delete"):
+        make_run(tmp_path).train()
+    kept.rename(policy)
+
+    def moved_at_the_end(progress: Progress) -> None:
+        if progress.steps >= SHORT.steps:
+            policy.rename(kept)
+
+    with pytest.raises(UsageError, match="is missing: put it back"):
+        make_run(tmp_path, report=moved_at_the_end).train()
+    assert not json.loads((tmp_path / "run.json").read_text())["finished"]
+    kept.rename(policy)
+    assert make_run(tmp_path).train().checkpoint.exists()
+
+
 def test_a_repeated_finished_run_returns_its_stored_result(tmp_path: Path) -> None:
     def run() -> TrainingRun:
         return make_run(tmp_path, settings=RunSettings(steps=256, evaluate_episodes=4))

@@ -36,7 +36,11 @@ def check(arguments: Sequence[str]) -> None:
 
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends processes together with their parent")
 OPTIONS = CommandOptions(
-    names=["rate", "fast"], flags=["fast"], reserved={"seed": "list them as seeds = [0, 1, 2]"}, check=check
+    names={"rate": "rate", "fast": "fast"},
+    flags=["fast"],
+    reserved={"seed": "list them as seeds = [0, 1, 2]"},
+    check=check,
+    curve_columns=lambda arguments: ["success"],
 )
 
 

@@ -74,11 +74,11 @@ def complete_sweep(tmp_path: Path, text: str) -> list[str]:
 def test_results_are_printed_before_the_error_of_a_wrong_curve(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command = complete_sweep(tmp_path, 'task = "insertion"\ncurve = "sucess"\n')
+    command = complete_sweep(tmp_path, 'task = "insertion"\ncurve = "exploration"\n')  # missing in this table
     assert main(command) == 2
     printed = capsys.readouterr()
     assert json.loads(printed.out)["runs"][0]["validation.success"] == 0.5
-    assert "learning curves have no column 'sucess'; did you mean 'success'" in printed.err
+    assert "learning curves have no column 'exploration'; valid names: success" in printed.err
     assert set(json.loads(printed.out)["files"]) == {"runs", "summary"}
 
 
@@ -100,6 +100,17 @@ def test_a_grid_file_of_something_else_is_not_replaced(tmp_path: Path, capsys: p
     assert (tmp_path / "grid.toml").read_text() == "mine = 1\n"
 
 
+@pytest.mark.parametrize("name", ["runs.csv", "summary.csv", "curves.csv", "curves.png"])
+def test_results_of_something_else_are_not_replaced(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "tiny.toml").write_text(GRID)
+    (tmp_path / name).write_text("mine")
+    assert main(["sweep", str(tmp_path / "tiny.toml"), "--out", str(tmp_path)]) == 2
+    assert f"{name} is not of these runs; choose another folder or delete it" in capsys.readouterr().err
+    assert (tmp_path / name).read_text() == "mine" and not (tmp_path / "grid.toml").exists()
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -109,6 +120,10 @@ def test_a_grid_file_of_something_else_is_not_replaced(tmp_path: Path, capsys: p
         ("[grid]\npresets = ['fast']", "grid: unknown key 'presets'; did you mean 'preset'?"),
         ("[options]\nattempts = 0", "--attempts must be above 0, got 0"),
         ("[options]\nrecipe = 'paper'", "--recipe is for other tasks than the insertion"),
+        ("curve = 'sucess'", "learning curves have no column 'sucess'; did you mean 'success'?"),
+        ("curve = 'exploration'\n[grid]\nalgorithm = ['imitation', 'ppo']", "have no column 'exploration'"),
+        ("[options]\nsteps = 16\n[grid]\nattempts = [32]", "'steps' and 'attempts' are one option; keep one of them"),
+        ("[options]\nsteps = 16\nattempts = 32", "'steps' and 'attempts' are one option; keep one of them"),
     ],
 )
 def test_a_wrong_grid_file_is_an_error_in_one_line(

@@ -3,6 +3,7 @@
 import argparse
 import itertools
 import time
+import warnings
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -11,11 +12,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.table import Table
 
 from gelflow.cli import options
 from gelflow.cli.exit_codes import SUCCESS
 from gelflow.cli.output import Output, progress_bar
+from gelflow.cli.tracking_summary import show_summary
 from gelflow.errors import UsageError
 from gelflow.gel.gel_file import ElasticGel, load_gel
 from gelflow.perception.camera_calibration import CameraCalibration, load_calibration
@@ -23,18 +24,20 @@ from gelflow.perception.errors import TrackerInitError
 from gelflow.perception.force.image_forces import GridScale, ImageForces, grid_angle
 from gelflow.perception.force.recorded_pad import RecordedPad, recorded_pad
 from gelflow.perception.grid_detection.grid_part import Polarity
-from gelflow.perception.mount_check import VisiblePart, check_calibrated_scale, find_visible_part, lines_text
-from gelflow.perception.output.forces import SUFFIX, force_text
+from gelflow.perception.mount_check import VisiblePart, check_calibrated_scale, check_uniform_scale, find_visible_part
+from gelflow.perception.output.forces import SUFFIX
 from gelflow.perception.output.init_error import picture_of_init_error
 from gelflow.perception.output.summary import TrackingSummary
 from gelflow.perception.output.writers import TrackedImage, TrackWriter, check_suffix, open_writer
 from gelflow.perception.sensors.profile import SensorProfile, load_sensor_profile
-from gelflow.perception.sources import ImageSource, SkippedImages, SourceImage, image_source, start_on_image
+from gelflow.perception.sources import ImageSource, SourceImage, image_source, start_on_image
 from gelflow.perception.tracker import MarkerTracker, TrackerConfig, TrackingResult
 from gelflow.session.records import software_versions
 
 if TYPE_CHECKING:
     from gelflow.view.tracking.tracking_page import TrackingPage
+
+_LARGEST_MAGNIFICATION = 1e6  # of the overlay's arrows
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -58,7 +61,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--calibration", type=Path, metavar="FILE", help="result of gelflow calibrate-camera: adds millimetres"
     )
     scale.add_argument(
-        "--pixels-per-mm", type=float, metavar="X", help="scale, without a calibration (default: pitch of the profile)"
+        "--pixels-per-mm",
+        type=float,
+        metavar="X",
+        help="scale, in pixels of the image as the camera sends it, without a calibration (default: pitch of the "
+        "profile)",
     )
     parser.add_argument(
         "--gel",
@@ -121,7 +128,7 @@ def run(args: argparse.Namespace) -> int:
         files = options.delete_empty(args.out)
         if summary.images:
             seconds, name = time.perf_counter() - begin, None if gel is None else gel.text
-            _show(output, summary, source.skipped, seconds, files, name)
+            show_summary(output, summary, source, seconds, files, name)
     return SUCCESS
 
 
@@ -130,8 +137,8 @@ def _check(args: argparse.Namespace) -> None:
     options.check_page_address(args, "show")
     if args.pixels_per_mm is not None and not 0 < args.pixels_per_mm < float("inf"):
         raise UsageError(f"--pixels-per-mm must be above 0, got {args.pixels_per_mm:g}")
-    if not args.magnify > 0:
-        raise UsageError(f"--magnify must be above 0, got {args.magnify}")
+    if not 0 < args.magnify <= _LARGEST_MAGNIFICATION:
+        raise UsageError(f"--magnify must be above 0 and at most {_LARGEST_MAGNIFICATION:g}, got {args.magnify:g}")
     for number, file in enumerate(args.out):
         check_suffix(file)
         options.check_new_file(file)
@@ -243,12 +250,17 @@ def _zeroed(
 def _scale(
     first: TrackingResult, source: ImageSource, calibration: CameraCalibration | None, args: argparse.Namespace
 ) -> float | None:
-    """The uniform scale [px/mm] where there is no calibration; None if it is not known."""
-    if calibration is not None or args.pixels_per_mm is not None:
-        scale: float | None = args.pixels_per_mm
-        return scale
-    pitch = source.profile.markers.pitch_mm
-    return first.spacing / pitch if pitch else None
+    """The uniform scale of the tracked images [px/mm] where there is no calibration; None if it is not known.
+
+    Raises UsageError when `--pixels-per-mm`, in pixels of the image as sent, does not fit the spacing of the markers.
+    """
+    pitch, reduce = source.profile.markers.pitch_mm, source.profile.image.reduce
+    if calibration is not None:
+        return None
+    if args.pixels_per_mm is None:
+        return first.spacing / pitch if pitch else None
+    check_uniform_scale(args.pixels_per_mm, reduce * first.spacing, pitch)
+    return float(args.pixels_per_mm) / reduce
 
 
 @dataclass(frozen=True)
@@ -274,14 +286,14 @@ def _gel(args: argparse.Namespace, profile: SensorProfile, pad: RecordedPad | No
 
 
 def _pad_scale(pad: RecordedPad, profile: SensorProfile) -> tuple[CameraCalibration | None, float | None]:
-    """The calibration or the scale [px/mm] of a recorded pad, for the part of its images that the profile uses."""
-    calibration, scale = pad.mount.calibration, pad.mount.pixels_per_mm
+    """The calibration or the scale of a recorded pad, in pixels of its whole images [px/mm]."""
+    calibration = pad.mount.calibration
     if calibration is not None and not profile.image.is_plain:
         raise UsageError(
             f"the calibration in the session's lab is for whole images, and the profile {profile.title!r} crops or "
             "reduces them: leave --profile out, or give --calibration"
         )
-    return calibration, None if scale is None else scale / profile.image.reduce
+    return calibration, pad.mount.pixels_per_mm
 
 
 def _forces(
@@ -296,6 +308,13 @@ def _forces(
         grid = GridScale(first.spacing / scale, scale)
     else:
         raise UsageError("--gel needs millimetres: give --calibration, --pixels-per-mm or a --profile with a pitch")
+    thickness = 1e3 * args.gel.thickness
+    if grid.pitch_mm > thickness:
+        warnings.warn(
+            f"markers {grid.pitch_mm:.3g} mm apart are too far from each other for forces on a gel {thickness:.3g} mm "
+            "thick: check the scale and the thickness",
+            stacklevel=2,
+        )
     angle = grid_angle(first.position, first.rows, first.cols)
     return ImageForces(args.gel, first.rows, first.cols, grid, angle)
 
@@ -335,64 +354,3 @@ def _tracked_image(
         centre = (np.array(frame.image.shape[1::-1]) - 1) / 2
         return TrackedImage(number, frame, tracked, (tracked.position - centre) / scale, tracked.displacement / scale)
     return TrackedImage(number, frame, tracked)
-
-
-def _show(
-    output: Output, summary: TrackingSummary, skipped: SkippedImages, wall: float, files: list[Path], gel: str | None
-) -> None:
-    """Print the summary; `wall` is the duration of the run [s], `gel` names the gel of the forces."""
-    values = summary.to_json()
-    if output.json:
-        not_tracked = {
-            "unreadable_images": skipped.unreadable,
-            "first_unreadable": skipped.first or None,
-            "dropped_images": skipped.dropped,
-        }
-        output.result(values | not_tracked | {"gel": gel, "seconds": wall, "files": files})
-        return
-    markers, spacing = values["rows"] * values["cols"], values["spacing_px"]
-    table = Table(show_header=False)
-    table.add_row("images", str(values["images"]))
-    if skipped.unreadable:
-        table.add_row("skipped", f"{skipped.unreadable} unreadable or without a grid; {skipped.first}")
-    if skipped.dropped:
-        table.add_row("dropped", f"{skipped.dropped} live images, while tracking and writing were behind")
-    table.add_row("markers", f"{markers}: {values['rows']} rows of {values['cols']}, {spacing:.1f} px apart")
-    if summary.visible:
-        table.add_row("visible", _visible_text(summary.visible, markers))
-    if summary.pixels_per_mm is not None:
-        table.add_row(
-            "scale", f"{summary.pixels_per_mm:.2f} px/mm everywhere: no lens and no tilt; see calibrate-camera"
-        )
-    worst = f"in the worst image {100 * values['tracked_share_min']:.1f} %"
-    table.add_row("tracked", f"{100 * values['tracked_share']:.1f} % ({worst})")
-    table.add_row("inferred", f"{100 * values['inferred_share']:.1f} %, from neighbours")
-    jitter = values["jitter_px"]
-    quiet = f"{jitter:.3f} px, in the quietest quarter of the images" if jitter is not None else "too few images"
-    table.add_row("rest jitter", quiet)
-    largest, largest_mm = values["largest_displacement_px"], values["largest_displacement_mm"]
-    if largest is not None:
-        mm = f", {largest_mm:.3f} mm" if largest_mm is not None else ""
-        where = values["largest_displacement_at"]
-        table.add_row("largest motion", f"{largest:.2f} px, {largest / spacing:.2f} of the spacing{mm} ({where})")
-    if gel is not None:
-        table.add_row("gel", gel)
-    if summary.largest_normal is not None:
-        table.add_row("largest force", force_text(summary.largest_normal))
-        table.add_row("slip", summary.slip.text())
-    usual, first = values["seconds_per_image"], values["seconds_first_image"]
-    speed = f"{1 / usual:.0f} a second tracked ({1e3 * usual:.2f} ms each, the first {1e3 * first:.0f} ms)"
-    table.add_row("speed", f"{speed}, {summary.images / wall:.0f} a second with reading and writing")
-    for file in files:
-        table.add_row("written" if summary.complete else "incomplete", str(file))
-    output.console.print(table)
-
-
-def _visible_text(parts: list[VisiblePart], markers: int) -> str:
-    """The visible lines of a printed grid, or how many there are where the image does not show which ones."""
-    rows, cols = parts[0].rows, parts[0].cols
-    count = f"{markers} of {rows * cols} printed markers"
-    if len(parts) == 1:
-        return f"{count}: {lines_text(parts[0].lines, rows, cols)}, counted in the image"
-    seen_rows, seen_cols = parts[0].shape
-    return f"{count}: {seen_rows} of {rows} rows, {seen_cols} of {cols} columns; the image does not show which ones"

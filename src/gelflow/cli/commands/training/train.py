@@ -26,10 +26,12 @@ from gelflow.cli.options import (
     add_randomization,
     add_seed,
     check_at_least,
+    checkpoint_for,
     part_task,
 )
 from gelflow.cli.output import Output, progress_bar
 from gelflow.errors import UsageError
+from gelflow.task import InsertionTask
 
 if TYPE_CHECKING:
     from gelflow.policies.evaluation import EvaluationResult
@@ -70,7 +72,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     insertion.add_argument(
         "--start", type=Path, nargs="?", const=_SHIPPED, metavar="FILE",
-        help="fine-tuning: start from the weights of this checkpoint, without FILE from those of the included policy",
+        help="fine-tuning: start from the weights of this checkpoint, without FILE of the included policy of the part",
     )  # fmt: skip
 
 
@@ -78,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
     """Train with a progress bar, then print the paths of the results."""
     check(args)
     if args.task != "insertion":
-        args.recipe = args.recipe or DEFAULT_RECIPE
+        args.recipe = recipe_name(args)
         return train_task(args)
     args.out = args.out or Path("runs/insertion")
     output = Output(args.json)
@@ -124,6 +126,13 @@ def check(args: argparse.Namespace) -> None:
         recipe_for(args.task, args.recipe or DEFAULT_RECIPE)
 
 
+def recipe_name(args: argparse.Namespace) -> str:
+    """The name of the recipe that the options select, without `--start`."""
+    if args.task != "insertion":
+        return args.recipe or DEFAULT_RECIPE
+    return DEFAULT_RECIPE if args.algorithm == _DEFAULT else str(args.algorithm)
+
+
 def _inserted(result: "EvaluationResult") -> str:
     corrections = f" in {result.length:.2f} corrections" if result.successes else ""
     return f"{result.success:.1%} inserted{corrections}"
@@ -131,15 +140,14 @@ def _inserted(result: "EvaluationResult") -> str:
 
 def _train(args: argparse.Namespace, progress: Progress) -> "TrainingResult":
     from gelflow.policies import recipes  # deferred: torch is slow to import
-    from gelflow.policies.checkpoint import default_checkpoint
 
-    recipe = DEFAULT_RECIPE if args.algorithm == _DEFAULT else args.algorithm
+    recipe = recipe_name(args)
     if args.start is not None:
         if args.algorithm != _DEFAULT:
             raise UsageError(f"--start is for --algorithm {_DEFAULT}, got {args.algorithm}")
         recipe = recipes.FINE_TUNING
         if args.start == _SHIPPED:
-            args.start = default_checkpoint()
+            args.start = _included_policy(part_task(args.part))
     defaults = recipes.recipe_for("insertion", recipe)
     args.envs = defaults.envs if args.envs is None else args.envs
     attempts = defaults.steps if args.attempts is None else args.attempts
@@ -167,6 +175,16 @@ def _train(args: argparse.Namespace, progress: Progress) -> "TrainingResult":
         command=_command(args, attempts),
         report=report,
     )
+
+
+def _included_policy(task: InsertionTask) -> Path:
+    """The included policy of the part of `task`, for `--start`. Raises UsageError when there is none."""
+    try:
+        return checkpoint_for(task, None)
+    except UsageError:
+        raise UsageError(
+            f"no policy for part {task.part.name!r} comes with gelflow; give --start the checkpoint of another part"
+        ) from None
 
 
 def _calibration_options(args: argparse.Namespace) -> dict[str, Any]:

@@ -93,11 +93,18 @@ def train_options() -> "CommandOptions":
     def check(arguments: Sequence[str]) -> None:
         train.check(parser.parse_args(arguments))
 
+    def curve_columns(arguments: Sequence[str]) -> Sequence[str]:
+        from gelflow.policies.recipes import recipe_for  # deferred: torch is slow to import
+
+        args = parser.parse_args(arguments)
+        return recipe_for(args.task, train.recipe_name(args)).curve_columns
+
     return CommandOptions(
-        names=[name for name in actions if name not in _RESERVED],
+        names={name: action.dest for name, action in actions.items() if name not in _RESERVED},
         flags=[name for name, action in actions.items() if action.nargs == 0],
         reserved=_RESERVED,
         check=check,
+        curve_columns=curve_columns,
     )
 
 
