@@ -16,6 +16,7 @@ import serial
 
 from gelflow.clock import Clock
 from gelflow.errors import PeerError, PeerTimeout, UsageError
+from gelflow.real.addresses import is_host
 
 # Lower bound of the time limits of connecting and writing [s, wall]: with a fast clock, a peer on the same machine
 # still needs time from the scheduler.
@@ -55,8 +56,8 @@ class TcpTransport:
     def __init__(
         self, host: str, port: int, *, clock: Clock, connect_timeout: float = 2.0, write_timeout: float = 0.5
     ) -> None:
-        if not host or not 0 < port < 65536:
-            raise UsageError(f"a TCP address needs a host and a port of 1 to 65535, got {host!r} and {port}")
+        if not is_host(host) or not 0 < port < 65536:
+            raise UsageError(f"a TCP address needs a valid host and a port of 1 to 65535, got {host!r} and {port}")
         self._peer = host, port
         self._clock = clock
         self._connect_timeout = connect_timeout

@@ -11,6 +11,7 @@ from urllib.parse import urlsplit
 
 from gelflow.clock import Clock
 from gelflow.errors import GelflowError, PeerError, PeerTimeout, UsageError
+from gelflow.real.addresses import is_host
 from gelflow.real.camera import codec
 from gelflow.real.camera.stream import OnImage, ReceivedImage, StreamCamera
 from gelflow.real.limits import LIMITS
@@ -72,7 +73,7 @@ class MjpegCamera(StreamCamera):
         except ValueError as error:
             raise UsageError(f"camera {name}: {url} is no valid address; expected http://HOST:PORT/path") from error
         plain = url.isascii() and not any(c.isspace() for c in url) and "@" not in parts.netloc
-        if parts.scheme != "http" or not parts.hostname or not plain:
+        if parts.scheme != "http" or not is_host(parts.hostname or "") or not plain:
             raise UsageError(f"camera {name}: expected http://HOST:PORT/path (no user name), got {url!r}")
         self._address = (parts.hostname, port)
         self._host = parts.netloc

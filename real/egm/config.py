@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 from gelflow.errors import UsageError
 from gelflow.geometry import Vector
+from gelflow.real.addresses import is_host
 from gelflow.real.limits import LIMITS
 
 DEFAULT_PORT = 6510
@@ -44,6 +45,8 @@ class EgmConfig:
             raise UsageError(f"workspace_min must be below workspace_max in x, y and z, got {box}")
         if not 0 <= self.port < 65536:
             raise UsageError(f"port must be 0 to 65535, got {self.port}")
+        if not is_host(self.host):
+            raise UsageError(f"host must be an IPv4 address of this computer or its name, got {self.host!r}")
         for name in (
             *("max_speed", "max_turn_speed", "ramp_time", "max_step", "max_turn", "joint_speed"),
             *("max_lead", "max_turn_lead", "lead_time", "lead_margin", "turn_lead_margin"),

@@ -6,6 +6,7 @@ sufficient without it.
 """
 
 import dataclasses
+import errno
 import math
 import os
 import socket
@@ -17,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gelflow import interrupts
 from gelflow.clock import ScaledClock
 from gelflow.errors import PeerError, PeerTimeout, SafetyError, UsageError
 from gelflow.geometry import PoseTuple
@@ -33,6 +35,10 @@ from gelflow.real.egm.timing import EgmTiming
 _START_TIMEOUT = 30.0
 _COMMAND_TIMEOUT = 1.0
 _POLL = 0.002
+_BIND_HINTS: dict[int | None, str] = {
+    errno.EADDRINUSE: "is another program listening there?",
+    errno.EACCES: "choose a port above 1023, here and on the controller",
+}
 
 
 class EgmArm:
@@ -60,7 +66,8 @@ class EgmArm:
         """Start the EGM process and wait for the first message of the robot.
 
         `timeout` [s, robot time]; None: that of the configuration. Raises UsageError when the port is in use, and
-        PeerTimeout when the robot sends nothing; the process has ended then, and `connect` may be called again.
+        PeerTimeout when the robot sends nothing, or PeerError when a deferred signal ends the wait; the process has
+        ended then, and `connect` may be called again.
         """
         limit = self._config.connect_timeout if timeout is None else timeout
         if self._helper is not None:
@@ -69,12 +76,7 @@ class EgmArm:
             self._start()
             failure = f"the EGM process did not start in {_START_TIMEOUT} s"
             self._wait(lambda: self._received_event("listening"), _START_TIMEOUT, failure)
-            self._wait(
-                lambda: self._opened().latest() is not None,
-                self._clock.wall(limit),
-                f"no EGM message on UDP port {self.port} within {limit:g} s: "
-                "start the RAPID program with EGMRunPose, check UCDevice address",
-            )
+            self._wait_first_message(limit)
         except BaseException:
             self.close()
             raise
@@ -90,7 +92,7 @@ class EgmArm:
             motors = "on" if self.state().motors_on else "off"
             raise PeerTimeout(
                 f"the controller does not follow EGM within {timeout:g} s (motors {motors}): "
-                "switch the motors on and start the RAPID program with EGMRunPose"
+                f"switch the motors on and start the RAPID program with EGMRunPose{self._foreign_text()}"
             ) from None
         self._refuse_when_latched()
 
@@ -106,7 +108,8 @@ class EgmArm:
             age = self._clock.now() - record.stamp
             if age > self._config.silence and not self._latched:
                 limit = self._config.silence
-                raise PeerTimeout(f"the newest EGM message is {age:.3f} s old, at most {limit} s is allowed")
+                text = f"the newest EGM message is {age:.3f} s old, at most {limit} s is allowed"
+                raise PeerTimeout(text + self._foreign_text())
             return ArmState(
                 position=np.array(record.measured[0]),
                 quaternion=np.array(record.measured[1]),
@@ -268,9 +271,9 @@ class EgmArm:
             udp.bind((self._config.host, self._config.port))
         except OSError as error:
             udp.close()
+            hint = _BIND_HINTS.get(error.errno, "host must be an IPv4 address of this computer; 0.0.0.0 means all")
             raise UsageError(
-                f"cannot listen for EGM on {self._config.host}:{self._config.port}: {error.strerror}; "
-                "is another program listening there?"
+                f"cannot listen for EGM on {self._config.host}:{self._config.port}: {error.strerror}; {hint}"
             ) from None
         self.port = udp.getsockname()[1]
         self._events = []
@@ -299,6 +302,23 @@ class EgmArm:
     def _running(self) -> bool:
         record = self._opened().latest()
         return record is not None and EgmFlag.FOLLOWING in record.flags and not self._latched
+
+    def _wait_first_message(self, limit: float) -> None:
+        opened = self._opened()
+        try:
+            self._wait(lambda: opened.latest() is not None or interrupts.is_pending(), self._clock.wall(limit), "")
+        except PeerTimeout:
+            raise PeerTimeout(
+                f"no EGM message on UDP port {self.port} within {limit:g} s: "
+                f"start the RAPID program with EGMRunPose, check UCDevice address{self._foreign_text()}"
+            ) from None
+        if opened.latest() is None:
+            raise PeerError("a signal ended the wait for the first EGM message")
+
+    def _foreign_text(self) -> str:
+        """For errors: the number of ignored messages of other senders; empty without any."""
+        count = self.counts.foreign
+        return f"; {count} messages of other senders were ignored" if count else ""
 
     def _received_event(self, kind: str) -> bool:
         return any(event.kind == kind for event in self._events)

@@ -100,7 +100,7 @@ class EgmLoop:
                 data, sender = self._udp.recvfrom(_LARGEST_MESSAGE)
             except BlockingIOError:
                 return messages
-            if sender != self._robot and (self._robot or (self._config.robot and sender[0] != self._config.robot)):
+            if not self._is_robot(sender, stamp):
                 self._cycles.count(foreign=1)
                 continue
             try:
@@ -110,13 +110,27 @@ class EgmLoop:
                 if self._cycles.counts.malformed == 1:
                     self._event("malformed", f"from {sender[0]}:{sender[1]}: {error}")
                 continue
-            if self._robot is None:
+            if sender != self._robot:
                 self._robot = sender
                 self._event("first message", f"from {sender[0]}:{sender[1]}")
             if self._generator.observe(feedback, stamp):
                 messages.append(feedback)
             else:
                 self._cycles.count(duplicates=1)
+
+    def _is_robot(self, sender: tuple[str, int], stamp: float) -> bool:
+        """Whether a message at `stamp` [s] is the robot's: the sender of the first one is the robot.
+
+        A controller that starts EGM again may send from another port: such a sender replaces one that is silent, unless
+        the controller was following references, or the arm is stopped.
+        """
+        if self._robot is None:
+            return self._config.robot in ("", sender[0])
+        if sender == self._robot:
+            return True
+        generator = self._generator
+        silent = stamp - generator.received > self._config.silence and not generator.following
+        return sender[0] == self._robot[0] and silent and not generator.latched
 
     def _answer(self) -> None:
         stamp = self._clock.now()

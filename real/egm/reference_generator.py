@@ -7,6 +7,7 @@ is sent until `reset`.
 """
 
 import math
+from contextlib import suppress
 from enum import IntFlag
 from typing import NamedTuple
 
@@ -65,6 +66,16 @@ class ReferenceGenerator:
     @property
     def target(self) -> Target | None:
         return self._target
+
+    @property
+    def following(self) -> bool:
+        """Whether the controller follows references."""
+        return self._following
+
+    @property
+    def received(self) -> float:
+        """Robot time of the newest feedback [s]; −inf before the first one."""
+        return self._received
 
     @property
     def flags(self) -> EgmFlag:
@@ -263,7 +274,11 @@ class ReferenceGenerator:
         lead, lead_turn = _difference((self._feedback.position, self._feedback.quaternion), self._reference)
         back = max(0.0, min(dot(lead, along), self._config.max_speed * self._config.cycle))
         turned = max(0.0, min(dot(lead_turn, about), self._config.max_turn_speed * self._config.cycle))
-        self._reference = _moved(self._reference, _scaled(along, -back), _scaled(about, -turned), 1.0)
+        move, turn = _scaled(along, -back), _scaled(about, -turned)
+        stretch = 1.0
+        with suppress(SafetyError):  # outside the joint ranges the arm comes to rest too
+            stretch = self._joint_stretch(self._reference, move, turn, 1.0)
+        self._reference = _moved(self._reference, move, turn, 1.0 / stretch)
         at_rest = back == turned == 0.0
         self._braking = None if at_rest or count <= 1 else (count - 1, along, about)
 

@@ -23,8 +23,12 @@ from gelflow.geometry import Pose, yaw_quaternion
 from gelflow.perception.camera_calibration import load_calibration
 from gelflow.perception.force.estimator import check_force_grid
 from gelflow.perception.frames import CameraMount
+from gelflow.real.addresses import is_host
+from gelflow.real.camera.driver import MjpegCamera
 from gelflow.real.limits import LAB_RANGES, LIMITS, MOCK_TIME_SCALE, Range
+from gelflow.real.transport import transport_for
 from gelflow.real.web_services.client import WebServicesClient
+from gelflow.real.wsg.checks import motion_time
 
 FORMAT = 1
 _MOST_LINES = 100  # of markers in one direction
@@ -68,6 +72,7 @@ class GripperSettings:
     def __post_init__(self) -> None:
         known = self.address.startswith(("serial:", "tcp:"))
         _require(known, f"address must be serial:DEVICE or tcp:HOST:PORT, got {self.address!r}")
+        transport_for(self.address, clock=ScaledClock())  # checks the address
         _check_ranges(self, "gripper.")
         text = f"part_width must be below open_width, got {self.part_width} and {self.open_width} m"
         _require(self.part_width < self.open_width, text)
@@ -89,10 +94,11 @@ class ArmSettings:
 
     def __post_init__(self) -> None:
         _check_ranges(self, "arm.")
+        _require(is_host(self.host), f"host must be an IPv4 address of this computer or its name, got {self.host!r}")
         try:
-            ipaddress.ip_address(self.robot or "0.0.0.0")
+            ipaddress.IPv4Address(self.robot or "0.0.0.0")
         except ValueError:
-            text = f"robot must be the IP address of the controller, or empty, got {self.robot!r}"
+            text = f"robot must be the IP address of the controller (IPv4), or empty, got {self.robot!r}"
             raise UsageError(text) from None
         if self.web_services:
             WebServicesClient(self.web_services)  # checks the address
@@ -121,6 +127,8 @@ class CameraSettings:
         known = self.source.startswith("http://") or re.fullmatch(r"uvc:(\d{1,4}|/dev/.+)", self.source)
         text = f"source must be http://HOST:PORT/…, uvc:INDEX or uvc:/dev/videoN, got {self.source!r}"
         _require(bool(known), text)
+        if self.source.startswith("http://"):
+            MjpegCamera(self.source, "source", ScaledClock())  # checks the address
         turned = self.rotation_deg in (0, 90, 180, 270)
         _require(turned, f"rotation_deg must be 0, 90, 180 or 270, got {self.rotation_deg}")
         lines = min(self.rows, self.cols) >= 3 and max(self.rows, self.cols) <= _MOST_LINES
@@ -335,6 +343,28 @@ class Lab:
             if allowed.time_limit:
                 value = getattr(self.limits, key.removeprefix("limits."))
                 _check_range(key, value, allowed._replace(high=self.time_scale * allowed.high))
+        self._check_heights()
+        self._check_times()
+
+    def _check_heights(self) -> None:
+        part, space = self.part, self.workspace
+        text = f"part.insert_to must be at least workspace.height_min, got {part.insert_to} and {space.height_min} m"
+        _require(part.insert_to >= space.height_min, text)
+        text = f"part.load_height must be at most workspace.height_max, got {part.load_height} and {space.height_max} m"
+        _require(part.load_height <= space.height_max, text)
+
+    def _check_times(self) -> None:
+        gripper, limits = self.gripper, self.limits
+        farthest = max(LIMITS.gripper_width[1] - gripper.open_width, gripper.open_width - gripper.part_width)
+        needed = motion_time(farthest, gripper.speed)
+        text = (
+            f"gripper.speed {gripper.speed} m/s is too low: {1e3 * farthest:.0f} mm take {needed:.1f} s, and "
+            f"limits.gripper_motion is {limits.gripper_motion} s"
+        )
+        _require(needed <= limits.gripper_motion, text)
+        for side, camera in (("left", self.cameras.left), ("right", self.cameras.right)):
+            text = f"cameras.{side}.latency must be below limits.stale_frame, got {camera.latency} and "
+            _require(camera.latency < limits.stale_frame, f"{text}{limits.stale_frame} s")
 
     @property
     def clock(self) -> ScaledClock:

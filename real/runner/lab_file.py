@@ -2,13 +2,12 @@
 
 import contextlib
 import dataclasses
-import json
 from pathlib import Path
 from typing import Any
 
 from gelflow.errors import UsageError
 from gelflow.real.runner.lab import FORMAT, Lab
-from gelflow.toml_tables import TomlTable, read_toml
+from gelflow.toml_tables import TomlTable, read_toml, toml_value
 
 _RENAMED_KEYS = {"clock_pace": "time_sync"}
 
@@ -52,8 +51,7 @@ def save_lab(lab: Lab, path: str | Path, *, title: str) -> None:
             if dataclasses.is_dataclass(value):
                 tables.append((f"{name}.{field.name}" if name else field.name, value))
             else:
-                # JSON strings, numbers, booleans and lists are valid TOML.
-                lines.append(f"{field.name} = {json.dumps(value)}")
+                lines.append(f"{field.name} = {toml_value(value)}")
     partial = path.with_name(path.name + ".part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -101,6 +101,7 @@ def run_insertions(plan: RunPlan) -> list[Insertion]:
                 forces=forces,
                 on_attempt=plan.on_attempt,
             )
+            runner.check_plan(supervisor, motion.pose())
             for number in range(plan.insertions):
                 plan.before_insertion(number)
                 results.append(runner.insert(number))

@@ -10,6 +10,7 @@ from http.cookiejar import CookieJar
 from urllib.parse import urlsplit
 
 from gelflow.errors import PeerError, PeerRefused, PeerTimeout, UsageError
+from gelflow.real.addresses import is_host
 
 USER, PASSWORD = "Default User", "robotics"  # of every controller, unless a site has changed them
 _MAX_ANSWER = 64 * 1024  # [bytes]
@@ -58,7 +59,7 @@ class WebServicesClient:
         refused = UsageError(f"web services: expected http://HOST or http://HOST:PORT, got {address!r}")
         try:
             parts = urlsplit(address)
-            valid = parts.scheme == "http" and bool(parts.hostname) and (parts.port is None or parts.port > 0)
+            valid = parts.scheme == "http" and is_host(parts.hostname or "") and (parts.port is None or parts.port > 0)
         except ValueError:
             raise refused from None
         if not valid or parts.path not in ("", "/") or parts.query or "@" in parts.netloc or not address.isascii():

@@ -27,9 +27,14 @@ def check_limits(limits: WsgLimits, **values: float) -> None:
             raise SafetyError(f"{name} {value} is outside {low} to {high} (m, m/s, N): nothing was sent")
 
 
+def motion_time(distance: float, speed: float) -> float:
+    """Time that the fingers need for `distance` [m] at `speed` [m/s], with acceleration and replies [s]."""
+    return distance / speed + _MOTION_MARGIN
+
+
 def check_duration(state: GripperState, width: float, speed: float, timeout: float) -> None:
     """Raise UsageError when moving to `width` [m] at `speed` [m/s] takes longer than `timeout` [s]."""
-    needed = abs(width - state.width) / speed + _MOTION_MARGIN
+    needed = motion_time(abs(width - state.width), speed)
     if needed > timeout:
         raise UsageError(
             f"{abs(width - state.width) * MM:.0f} mm at {speed * MM:.0f} mm/s take {needed:.1f} s, more than the "

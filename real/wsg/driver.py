@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Mapping
 from types import TracebackType
 
+from gelflow import interrupts
 from gelflow.clock import Clock
 from gelflow.errors import GelflowError, PeerError, PeerRefused, PeerTimeout, SafetyError, UsageError
 from gelflow.protocols import GripperState
@@ -132,6 +133,7 @@ class WsgGripper:
         self._acknowledged = link.corrupt  # bytes left on the line from an earlier session are no fault of this one
         _log.info("gripper %s at %s, firmware %#06x", serial, link.address, int(firmware))
 
+    @interrupts.deferred()  # without the announcement, the device raises FAST STOP
     def close(self, *, reason: str = "closed by the program") -> None:
         """Stop the fingers, announce the disconnect, close. May be called twice; errors are logged, not raised.
 
@@ -269,14 +271,16 @@ class WsgGripper:
     def acknowledge_fault(self) -> None:
         """Unlock motion after an operator has inspected the fault. Nothing in gelflow calls this by itself.
 
-        Raises PeerRefused when the fault remains.
+        No effect in a dry run. Raises PeerRefused when the fault remains.
         """
         link = self._connected()
         self._record("acknowledge fault", {})
+        if self._config.dry_run:
+            return
         link.request(codec.acknowledge())
         self._acknowledged = link.corrupt
         try:
-            self._settle(lambda s: not s.fault, "free of faults", sent=True)
+            self._settle(lambda s: not s.fault, "free of faults")
         except PeerTimeout:
             raise PeerRefused(f"the gripper still reports {self.state().fault} after the acknowledgement") from None
 
@@ -314,9 +318,9 @@ class WsgGripper:
                     raise PeerTimeout(f"the gripper at {link.address} did not {what} within the reply time-out")
                 self._changed.wait(min(left, 0.1))
 
-    def _settle(self, reached: Callable[[GripperState], bool], what: str, *, sent: bool = False) -> None:
+    def _settle(self, reached: Callable[[GripperState], bool], what: str) -> None:
         """After a result: wait for a state that was measured later and is consistent with it."""
-        if self._config.dry_run and not sent:
+        if self._config.dry_run:
             return
         link, since = self._connected(), self._clock.now()
 

@@ -43,6 +43,21 @@ def resume() -> None:
             raise Interrupted(_State.pending)
 
 
+def is_pending() -> bool:
+    """Whether `resume` will raise a deferred signal, so that a long wait in this thread should end."""
+    return threading.current_thread() is threading.main_thread() and bool(_State.pending) and not _State.raised
+
+
+@contextlib.contextmanager
+def deferred() -> Iterator[None]:
+    """Defer signals in this block, or in the function that this decorates; see `defer` and `resume`."""
+    defer()
+    try:
+        yield
+    finally:
+        resume()
+
+
 @contextlib.contextmanager
 def interruptible() -> Iterator[list[Callable[[], None]]]:
     """In this block the first signal of `SIGNALS` raises Interrupted in the main thread, which must run it.

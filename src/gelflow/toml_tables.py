@@ -4,6 +4,7 @@ import dataclasses
 import difflib
 import json
 import math
+import re
 import tomllib
 import typing
 from collections.abc import Collection, Mapping, Sequence
@@ -31,18 +32,45 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def toml_text(tables: Mapping[str, Any], *, name: str = "") -> str:
-    """TOML of nested tables of numbers, strings, booleans and lists, and of lists of tables."""
+    """TOML of nested tables of numbers, strings, booleans and lists, and of lists of tables.
+
+    Raises UsageError for a value that TOML cannot express; see `toml_value`.
+    """
     values = {key: value for key, value in tables.items() if not _has_tables(value)}
-    # JSON strings, finite numbers, booleans and lists are valid TOML.
-    lines = [f"{key} = {json.dumps(value)}" for key, value in values.items()]
+    lines = [f"{_toml_key(key)} = {toml_value(value)}" for key, value in values.items()]
     for key, value in tables.items():
         if not _has_tables(value):
             continue
-        dotted = f"{name}.{key}" if name else key
+        dotted = f"{name}.{_toml_key(key)}" if name else _toml_key(key)
         head, inner = (f"[{dotted}]", [value]) if isinstance(value, dict) else (f"[[{dotted}]]", value)
         for table in inner:
             lines += ["", head, toml_text(table, name=dotted).rstrip("\n")]
     return "\n".join(lines) + "\n"
+
+
+def toml_value(value: Any) -> str:
+    """A number, string, boolean, or list or tuple of these as TOML, in ASCII.
+
+    Raises UsageError for another type, such as None, and for a string with a lone surrogate, which has no UTF-8.
+    """
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(toml_value, value))}]"
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(float(value))  # inf, -inf or nan
+    surrogate = isinstance(value, str) and re.search("[\ud800-\udfff]", value)
+    if surrogate or not isinstance(value, str | bool | int | float):
+        raise UsageError(f"a TOML file cannot contain {value!r}")
+    # JSON strings, finite numbers and booleans are valid TOML, except for the escapes of some characters.
+    return re.sub("[^ -~]", lambda match: _escaped(match[0]), json.dumps(value, ensure_ascii=False))
+
+
+def _escaped(character: str) -> str:
+    code = ord(character)
+    return f"\\u{code:04x}" if code < 1 << 16 else f"\\U{code:08x}"
+
+
+def _toml_key(key: str) -> str:
+    return key if re.fullmatch("[A-Za-z0-9_-]+", key) else toml_value(key)
 
 
 def _has_tables(value: Any) -> bool:

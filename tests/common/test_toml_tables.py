@@ -1,12 +1,14 @@
 """Strict reading of TOML tables: values, defaults and error messages."""
 
+import math
+import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
 from gelflow.errors import UsageError
-from gelflow.toml_tables import TomlTable, read_toml, set_by_path, suggestion
+from gelflow.toml_tables import TomlTable, read_toml, set_by_path, suggestion, toml_text
 
 TABLE = TomlTable({"n": 3, "x": 0.5, "name": "left", "on": True, "sizes": [1, 2.5], "sub": {"k": 1}}, "file.toml")
 
@@ -31,6 +33,21 @@ class Outer:
     inner: Inner
     scale: float = 1.0
     on: bool = False
+
+
+def test_written_values_are_read_back() -> None:
+    tables = {
+        "text": '\U0001f916 \u00e4 \x7f \n " \\ ',
+        "key with a space": [1, 2.5, math.inf, True],
+        "": 1e-300,
+        "a.b": {"sub table": {"rows": [{"x y": -math.inf}, {"z": []}]}},
+    }
+    assert tomllib.loads(toml_text(tables)) == tables
+    assert toml_text({"a": 0.5, "b": "\u00e4", "c": (1, 2)}) == 'a = 0.5\nb = "\\u00e4"\nc = [1, 2]\n'
+    assert math.isnan(tomllib.loads(toml_text({"nan": math.nan}))["nan"])
+    for value in (None, "\udc80", [None]):
+        with pytest.raises(UsageError, match="a TOML file cannot contain"):
+            toml_text({"a": value})
 
 
 def test_values_are_converted() -> None:

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import pytest
 
 from gelflow.clock import ScaledClock
-from gelflow.errors import PeerTimeout
+from gelflow.errors import PeerTimeout, UsageError
 from gelflow.real.transport import SerialTransport, transport_for
 
 
@@ -40,6 +40,12 @@ def test_last_command_arrives_when_the_peer_is_still_sending() -> None:
         transport.close()
         thread.join(10.0)
     assert ended == [b"disconnect", b""]
+
+
+@pytest.mark.parametrize("host", ["192.168.1..20", ".local", "a" * 64, "a\0b", ""])
+def test_a_name_that_cannot_be_looked_up_is_refused(host: str) -> None:
+    with pytest.raises(UsageError, match=r"tcp:HOST:PORT|needs a valid host"):
+        transport_for(f"tcp:{host}:1000", clock=ScaledClock(1.0))
 
 
 def test_close_does_not_wait_for_a_peer_that_does_not_close() -> None:

@@ -110,6 +110,35 @@ def test_damaged_channels_are_recovered_from_the_end_of_the_file(tmp_path: Path)
         assert len(list(reader.records(["/left/image"]))) == report.messages
 
 
+@pytest.mark.parametrize("damage", ["name", "number", "length"])
+def test_damaged_metadata_are_restored_from_the_description(tmp_path: Path, damage: str) -> None:
+    path = make(tmp_path / "session.mcap")
+    with SessionReader(path) as reader:
+        epoch, before = reader.epoch, [record.time for record in reader.records()]
+    data = bytearray(path.read_bytes())
+    name = data.index(b"gelflow", data.index(b"\x0c", 8))  # 0x0c: a metadata record
+    place = {"name": name, "number": data.index(b"format", name) + 10, "length": name - 8}[damage]
+    data[place] = ord("x") if damage != "length" else 0xFF
+    path.write_bytes(data)
+    report = recover(path, tmp_path / "saved.mcap")
+    with SessionReader(report.path) as reader:
+        assert reader.description()["who"] == "test" and reader.epoch == pytest.approx(epoch, abs=1e-6)
+        assert [record.time for record in reader.records()] == pytest.approx(before, abs=1e-6)
+    assert report.messages == 41
+
+
+def test_another_programs_file_is_no_session(tmp_path: Path) -> None:
+    with (tmp_path / "other.mcap").open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        channel = writer.register_channel("/session", "json", 0)
+        writer.add_message(channel, 5, b"[1]", 5, 0)
+        writer.finish()  # type: ignore[no-untyped-call]
+    with pytest.raises(UsageError, match="name a session recorded by gelflow"):
+        recover(tmp_path / "other.mcap", tmp_path / "saved.mcap")
+    assert [file.name for file in tmp_path.iterdir()] == ["other.mcap"]
+
+
 @pytest.mark.parametrize("wrong", ["position", "channel"])
 def test_damage_in_the_index_costs_no_other_records(tmp_path: Path, wrong: str) -> None:
     path = make(tmp_path / "session.mcap")

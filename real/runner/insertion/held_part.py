@@ -200,7 +200,8 @@ class HeldPart:
         the height of the rim.
         """
         part, space = self._lab.part, self._lab.workspace
-        end = max(part.insert_to + self.height_offset, space.height_min)
+        floor = part.insert_to + self.height_offset
+        end = max(floor, space.height_min)  # a rim below the taught one
         self._motion.supervisor.phases.enter(Phase.LOWER)
         contact = self._guard.move(
             self._pose(planar_pose, end),
@@ -211,7 +212,7 @@ class HeldPart:
         if contact is None:
             return None
         height = self._lower_face()
-        on_floor = height - end <= self._lab.hole.height_error
+        on_floor = height - floor <= self._lab.hole.height_error
         self._event("contact with the floor" if on_floor else "contact below the rim", contact, height=height)
         if on_floor:
             return None
@@ -221,12 +222,14 @@ class HeldPart:
         return reading
 
     def retreat(self, height: float) -> None:
-        """Move straight up until the lower face is at `height` [m] above the taught floor.
+        """Move straight up until the lower face is at `height` [m] above the taught floor; never down.
 
         Raises PeerError when the part is stuck.
         """
         supervisor = self._motion.supervisor
         supervisor.phases.enter(Phase.RETREAT)
+        if self._lower_face() >= height:  # contact from below does not end this motion
+            return
         x, y, yaw, _ = supervisor.hole_coordinates(supervisor.within_workspace(self._motion.pose()))
         contact = self._guard.move(
             self._pose((x, y, yaw), height),

@@ -19,6 +19,7 @@ from gelflow.real.runner.cell import Cell
 from gelflow.real.runner.insertion.attempt import PLAN_COMPLETE, Attempt, Insertion, PlanarPose
 from gelflow.real.runner.insertion.held_part import HeldPart, HoleNotFound, PartSlipped
 from gelflow.real.runner.insertion.planned_motions import PlanPolicy, check_motions
+from gelflow.real.runner.lab import Lab
 from gelflow.real.runner.motion_executor import MotionExecutor, PartLost
 from gelflow.real.runner.phases import Phase
 from gelflow.real.runner.supervisor import Supervisor
@@ -50,7 +51,8 @@ class InsertionRunner:
     """Inserts parts in a connected cell. The thread of `motion` must be running.
 
     With a `PlanPolicy` the attempts on each part are the motions of its plan; the part is then handed back. Raises
-    UsageError when one of them exceeds the limits of lab or task.
+    UsageError when one of them exceeds the limits of lab or task, and SafetyError when the heights of lab and task
+    contradict each other.
     """
 
     def __init__(
@@ -65,18 +67,7 @@ class InsertionRunner:
         on_attempt: Callable[[int, Attempt], None] = lambda number, attempt: None,
     ) -> None:
         lab = cell.lab
-        if task.descent > lab.descent.max_depth:
-            deep, allowed = 1e3 * task.descent, 1e3 * lab.descent.max_depth
-            raise SafetyError(
-                f"the task descends by {deep:g} mm, descent.max_depth of the lab file allows {allowed:g} mm; raise it, "
-                "or train with a smaller [descent] depth in the part file"
-            )
-        if task.success_height - lab.part.insert_to <= lab.hole.height_error:
-            low, height, error = (1e3 * v for v in (lab.part.insert_to, task.success_height, lab.hole.height_error))
-            raise SafetyError(
-                f"contact at the rim and at the floor cannot be distinguished: part.insert_to is {low:g} mm, the part "
-                f"is inserted below {height:g} mm, and hole.height_error is {error:g} mm; reduce one of them"
-            )
+        _check_heights(lab, task)
         self._motions = policy.motions if isinstance(policy, PlanPolicy) else ()
         check_motions(self._motions, lab, task)
         self._cell, self._policy, self._task = cell, policy, task
@@ -376,6 +367,28 @@ class InsertionRunner:
         x, y, yaw, height = supervisor.hole_coordinates(supervisor.within_workspace(self._motion.pose()))
         if height < self._lab.part.load_height - _LEVEL:
             self._motion.move(self.pose((x, y, yaw), self._lab.part.load_height))
+
+
+def _check_heights(lab: Lab, task: InsertionTask) -> None:
+    """Raise SafetyError when the heights of the lab file do not fit the task."""
+    if task.descent > lab.descent.max_depth:
+        deep, allowed = 1e3 * task.descent, 1e3 * lab.descent.max_depth
+        raise SafetyError(
+            f"the task descends by {deep:g} mm, descent.max_depth of the lab file allows {allowed:g} mm; raise it, "
+            "or train with a smaller [descent] depth in the part file"
+        )
+    if task.success_height - lab.part.insert_to <= lab.hole.height_error:
+        low, height, error = (1e3 * v for v in (lab.part.insert_to, task.success_height, lab.hole.height_error))
+        raise SafetyError(
+            f"contact at the rim and at the floor cannot be distinguished: part.insert_to is {low:g} mm, the part "
+            f"is inserted below {height:g} mm, and hole.height_error is {error:g} mm; reduce one of them"
+        )
+    highest = task.start_height + lab.hole.height_error  # of the start of an attempt, above the highest rim
+    if lab.part.load_height <= highest:
+        raise SafetyError(
+            f"the hand-over is too low: part.load_height is {1e3 * lab.part.load_height:g} mm, and an attempt may "
+            f"start at {1e3 * highest:g} mm (hole.height_error included); raise part.load_height"
+        )
 
 
 class NotGrasped(PeerRefused):

@@ -8,6 +8,7 @@ from gelflow.real.wsg.checks import may_hold_part
 from gelflow.real.wsg.driver import WsgGripper
 
 _WIDTH_TOLERANCE = 0.5e-3  # fingers that are open by less are opened [m]
+_CLEARANCE = 5e-3  # beyond the width of a part that is wider than `open_width` [m]
 
 
 def home(session: Session) -> Result:
@@ -28,13 +29,14 @@ def home(session: Session) -> Result:
         if not session.agreed(question, gripper.state):
             return {"done": False, "state": state}
         if state.grasp == "holding":  # the device then accepts no other motion
-            gripper.release(width=session.lab.gripper.open_width, speed=session.lab.gripper.speed)
+            width = _release_width(gripper, state, session.lab.gripper.open_width)
+            gripper.release(width=width, speed=session.lab.gripper.speed)
         gripper.home(part_removed=held)
         return {"done": True, "state": gripper.state()}
 
 
 def open_fingers(session: Session) -> Result:
-    """Open the fingers to the lab file's `open_width`; a held part is released.
+    """Open the fingers to the lab file's `open_width`, or beyond a wider part; a held part is released.
 
     Raises SafetyError while the gripper reports a fault or is not homed, PeerError when it does not answer or refuses.
     """
@@ -48,13 +50,14 @@ def open_fingers(session: Session) -> Result:
             session.say(f"the fingers are open already: {_shown(state)}")
             return {"done": True, "state": state}
         what = "Hold the part: it is released" if held else "Hold a part that may fall"
-        question = f"{what}. The fingers open from {1e3 * state.width:.1f} to {1e3 * lab.open_width:.1f} mm. Open?"
+        width = _release_width(gripper, state, lab.open_width) if held else lab.open_width
+        question = f"{what}. The fingers open from {1e3 * state.width:.1f} to {1e3 * width:.1f} mm. Open?"
         if not session.agreed(question, gripper.state):
             return {"done": False, "state": state}
         if held:
-            gripper.release(width=lab.open_width, speed=lab.speed)
+            gripper.release(width=width, speed=lab.speed)
         else:
-            gripper.move(width=lab.open_width, speed=lab.speed)
+            gripper.move(width=width, speed=lab.speed)
         return {"done": True, "state": gripper.state()}
 
 
@@ -71,6 +74,13 @@ def acknowledge(session: Session) -> Result:
             return {"done": False, "state": state, "fault": state.fault}
         gripper.acknowledge_fault()
         return {"done": True, "state": gripper.state(), "fault": state.fault}
+
+
+def _release_width(gripper: WsgGripper, state: GripperState, open_width: float) -> float:
+    """`open_width`; for a part that is wider, its width and a clearance, within the gripper's limits [m]."""
+    if state.width < open_width:
+        return open_width
+    return min(state.width + _CLEARANCE, gripper.limits.width[1])
 
 
 def _gripper(session: Session) -> WsgGripper:

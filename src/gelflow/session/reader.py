@@ -41,6 +41,10 @@ class Record:
     value: Any
 
 
+class NotASession(UsageError):
+    """An MCAP file without the metadata of a session."""
+
+
 class SessionReader:
     """Reads the session at `path`. Use it as a context manager, or call `open` and `close`."""
 
@@ -195,7 +199,7 @@ class SessionReader:
             if metadata.name == "gelflow":
                 self._take_metadata(metadata.metadata)
                 return
-        raise UsageError(f"{self.path} is an MCAP file but not a gelflow session; name a session recorded by gelflow")
+        raise NotASession(f"{self.path} is an MCAP file but not a gelflow session; name a session recorded by gelflow")
 
     def _take_metadata(self, metadata: Mapping[str, str]) -> None:
         """The date of robot time 0. Raises UsageError for a newer format."""

@@ -1,6 +1,7 @@
 """Recovery of unfinished or damaged sessions: copies every complete record into a new file."""
 
 import contextlib
+import json
 import os
 import struct
 from bisect import bisect_right
@@ -21,7 +22,7 @@ from mcap.writer import MCAP0_MAGIC, Writer
 from gelflow import __version__
 from gelflow.errors import PeerError, UsageError
 from gelflow.session.messages import DECODE_ERRORS, READ_ERRORS
-from gelflow.session.reader import SessionReader, is_being_recorded, is_finished, open_recording
+from gelflow.session.reader import NotASession, SessionReader, is_being_recorded, is_finished, open_recording
 from gelflow.session.recorder import CHUNK_BYTES
 
 _HEAD = struct.Struct("<BQ")  # opcode and length of a record
@@ -41,8 +42,8 @@ class RecoveryReport:
 def recover(source: str | Path, target: str | Path) -> RecoveryReport:
     """Copy every complete record of `source` into the finished session `target`, which must not exist.
 
-    Raises UsageError when `source` is finished and undamaged or a path is wrong, and PeerError when `source` contains
-    no complete message.
+    Raises UsageError when `source` is finished and undamaged, is no session or a path is wrong, and PeerError when
+    `source` contains no complete message.
     """
     source, target = Path(source), Path(target)
     _check_new(target)
@@ -81,6 +82,11 @@ def _copied(stream: BinaryIO, source: Path, target: Path) -> "_Copy":
             copy.finish(source)
         if copy.messages == 0:
             raise PeerError(f"{source} contains no complete message; there is nothing to recover")
+        if not copy.described:
+            raise UsageError(
+                f"{source} contains neither the metadata nor the description of a gelflow session; name a session "
+                "recorded by gelflow"
+            )
         _check_new(target)
         partial.replace(target)
     finally:
@@ -94,7 +100,7 @@ def _check_not_whole(source: Path) -> None:
         with SessionReader(source) as session:
             for _ in session.records():
                 pass
-    except PeerError:
+    except (PeerError, NotASession):  # the metadata may be damaged
         return
     raise UsageError(f"{source} is finished and undamaged; there is nothing to recover")
 
@@ -108,6 +114,8 @@ class _Copy:
         self._writer.start(library=f"gelflow {__version__} recover")
         self._schemas: dict[int, int] = {0: 0}
         self._channels: dict[int, int] = {}
+        self._topics: dict[int, str] = {}  # by the channel numbers of the source
+        self.described = False  # format and epoch of the session are known
         self.messages = self.damaged = self.lost = 0
         self.first = self.last = 0
 
@@ -131,12 +139,27 @@ class _Copy:
             elif opcode == Opcode.MESSAGE:
                 records = [Message.read(stream, len(data))]
             elif opcode == Opcode.METADATA:
-                metadata = Metadata.read(stream)
-                self._writer.add_metadata(metadata.name, metadata.metadata)
+                self._put_metadata(Metadata.read(stream))
             for record in records:
                 self._put(record)
         except DECODE_ERRORS:
             self.damaged += 1
+
+    def _put_metadata(self, record: Metadata) -> None:
+        """Copy metadata. Raises one of `DECODE_ERRORS` when those of the session are damaged."""
+        if record.name == "gelflow":
+            int(record.metadata["format"]), int(record.metadata.get("epoch_ns", "0"))
+            if self.described:
+                return
+            self.described = True
+        self._writer.add_metadata(record.name, record.metadata)
+
+    def _describe(self, message: Message) -> None:
+        """Write the metadata of the session, which are damaged, from its description in `message`."""
+        with contextlib.suppress(*DECODE_ERRORS, TypeError):
+            description = dict(json.loads(message.data))
+            date = round(1e9 * float(description.get("epoch", 0.0)))
+            self._put_metadata(Metadata("gelflow", {"format": str(description["format"]), "epoch_ns": str(date)}))
 
     def _put(self, record: McapRecord) -> None:
         if isinstance(record, Schema) and record.id not in self._schemas:
@@ -145,7 +168,10 @@ class _Copy:
             self._channels[record.id] = self._writer.register_channel(
                 record.topic, record.message_encoding, self._schemas[record.schema_id], record.metadata
             )
+            self._topics[record.id] = record.topic
         elif isinstance(record, Message):
+            if not self.described and self._topics[record.channel_id] == "/session":
+                self._describe(record)
             channel = self._channels[record.channel_id]
             self._writer.add_message(channel, record.log_time, record.data, record.publish_time, record.sequence)
             self.first = record.log_time if self.messages == 0 else min(self.first, record.log_time)

@@ -256,7 +256,16 @@ def test_image_rate_is_in_robot_time() -> None:
 
 
 @pytest.mark.parametrize(
-    "url", ["ftp://host/", "http://", "http://host:port/", "http://user:word@host/", "http://ho st/", "http://höst/"]
+    "url",
+    [
+        "ftp://host/",
+        "http://",
+        "http://host:port/",
+        "http://user:word@host/",
+        "http://ho st/",
+        "http://höst/",
+        "http://a..b/",
+    ],
 )
 def test_invalid_addresses_are_refused(url: str) -> None:
     with pytest.raises(UsageError, match="camera left"):

@@ -15,8 +15,9 @@ from pathlib import Path
 import pytest
 from tests.real.egm.harness import CONFIG, DOWN, MOCK, START, ArmAndMock, free_port, near_start
 
+from gelflow import interrupts
 from gelflow.clock import ScaledClock
-from gelflow.errors import PeerError, PeerTimeout, UsageError
+from gelflow.errors import PeerError, PeerTimeout, SafetyError, UsageError
 from gelflow.hardware_mocks.egm.device import MockEgmArm
 from gelflow.hardware_mocks.plant import KinematicArm
 from gelflow.real.egm.codec import EgmFeedback, decode_sensor, encode_robot
@@ -68,12 +69,34 @@ def test_missing_robot_gives_a_one_line_error_and_ends_the_process() -> None:
         arm.state()
 
 
+def test_a_deferred_signal_ends_the_wait_for_the_robot() -> None:
+    arm = EgmArm(dataclasses.replace(CONFIG, port=free_port()), clock=ScaledClock())
+    timer = threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT))
+    begun = time.monotonic()
+    with pytest.raises(interrupts.Interrupted), interrupts.interruptible():
+        timer.start()
+        with interrupts.deferred():
+            arm.connect(timeout=120)
+    assert time.monotonic() - begun < 60 and arm.pid is None
+
+
 def test_port_in_use_is_reported() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.1", 0))
         port = other.getsockname()[1]
         with pytest.raises(UsageError, match=f"cannot listen for EGM on 127.0.0.1:{port}: Address already in use"):
             EgmArm(dataclasses.replace(CONFIG, port=port), clock=ScaledClock()).connect()
+
+
+def test_an_address_on_which_nothing_can_listen_is_reported() -> None:
+    """192.0.2.1 is reserved for documentation; names with an empty part or NUL are refused before a socket is used."""
+    arm = EgmArm(dataclasses.replace(CONFIG, host="192.0.2.1"), clock=ScaledClock())
+    with pytest.raises(UsageError, match=r"on 192\.0\.2\.1:\d+: .*; host must be an IPv4 address") as caught:
+        arm.connect()
+    assert "another program" not in str(caught.value)
+    for host in ("192.168.1..5", "\u00e4..b", "a\0b"):
+        with pytest.raises(UsageError, match="host must be an IPv4 address of this computer"):
+            dataclasses.replace(CONFIG, host=host)
 
 
 def test_killed_egm_process_is_detected(cell: ArmAndMock) -> None:
@@ -193,6 +216,55 @@ def test_invalid_duplicate_and_foreign_messages_are_counted_and_ignored() -> Non
             robot.recv(4096)
         assert [r.sequence for r in arm.drain_log()] == [1, 2]
         assert any(e.kind == "malformed" and "EgmRobot" in e.text for e in arm.drain_events())
+
+
+def robot_message(sequence: int, **changes: str) -> bytes:
+    joints = inverse(tuple(START), tuple(DOWN), near=HOME)
+    whole = EgmFeedback(sequence, sequence * 0.004, tuple(START), tuple(DOWN), joints)
+    return encode_robot(dataclasses.replace(whole, **changes))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("following", [False, True])
+def test_egm_that_starts_again_from_another_port_is_followed(following: bool) -> None:
+    """Only where the sender before it is silent and the controller did not follow references; never from another IP."""
+    arm = EgmArm(
+        dataclasses.replace(CONFIG, port=free_port(), host="0.0.0.0", stale=0.5, silence=1.0), clock=ScaledClock()
+    )
+    with contextlib.ExitStack() as stack:
+        stack.callback(arm.close)
+        first, again, stranger = (
+            stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(3)
+        )
+        for one, address in ((first, "127.0.0.1"), (again, "127.0.0.1"), (stranger, "127.0.0.2")):
+            one.bind((address, 0))
+
+        def send(sender: socket.socket, count: int, mci: str = "running") -> None:
+            for sequence in range(count):
+                if not ended.is_set() or sender is not first:
+                    sender.sendto(robot_message(sequence, mci=mci), ("127.0.0.1", arm.port))
+                    time.sleep(0.004)
+
+        ended = threading.Event()
+        caller = threading.Thread(target=send, args=(first, 20_000, "running" if following else "stopped"))
+        stack.callback(caller.join)
+        stack.callback(ended.set)
+        arm._start()
+        caller.start()
+        arm._wait_first_message(60)
+        send(again, 3)  # the first one is not silent
+        arm._wait(lambda: arm.counts.foreign == 3, 10, "the messages of another port were not ignored")
+        ended.set()
+        time.sleep(1.2)
+        send(stranger, 50)
+        with pytest.raises((PeerTimeout, SafetyError), match=r"of other senders were ignored|is stopped"):
+            arm.wait_following(0.1)
+        send(again, 100)
+        if following:
+            with pytest.raises(SafetyError, match="no EGM message"):
+                arm.wait_following(0.1)
+            arm._wait(lambda: arm.counts.foreign == 153, 10, "the messages of another port were not ignored")
+        else:
+            arm.wait_following(10)
 
 
 def test_messages_of_other_addresses_than_the_configured_robot_are_ignored() -> None:

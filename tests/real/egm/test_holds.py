@@ -116,6 +116,24 @@ def test_joint_speeds_stay_within_max_speed_deviation(turn_deg: float, turn_spee
     assert np.median(speeds) > 0.9 * MAX_SPEED_DEVIATION
 
 
+@pytest.mark.parametrize("turn_deg", [0.0, 15.0])
+def test_joint_speeds_stay_within_max_speed_deviation_in_a_hold(turn_deg: float) -> None:
+    """The reference is ahead of an arm that lags by 5 cycles, and returns to it."""
+    robot = Robot(dataclasses.replace(CONFIG, joint_speed=MAX_SPEED_DEVIATION), lag=5)
+    robot.step()
+    half = math.radians(turn_deg) / 2
+    goal = Target((0.41, 0.0, 0.305), (0.0, math.sin(half), math.cos(half), 0.0), 1e9, 0.02, math.radians(10.0))
+    robot.generator.set_target(goal, robot.now)
+    robot.step(200)
+    robot.generator.hold(robot.now, "test")
+    count = len(robot.sent)
+    robot.step(60)
+    poses = [inverse(*pose, near=(0.0, 0.3, 0.1, 0.0, 1.2, 0.0)) for pose in robot.sent[count - 1 :]]
+    steps = np.abs(np.diff(np.array(poses), axis=0)).max(axis=1)
+    assert 0 < steps.max() <= MAX_SPEED_DEVIATION * CYCLE * 1.01
+    assert steps[25:].max() == 0
+
+
 # On the wire: the controller has a lag of 10 ms and answers a reference one to two cycles later, the arm lags by 15 ms.
 
 

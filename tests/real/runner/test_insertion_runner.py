@@ -1,6 +1,8 @@
 """Insertion runner against the mock robot over pty, TCP, UDP and HTTP: insertions, lost parts, invalid actions."""
 
 import threading
+from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,6 +13,7 @@ import pytest
 from numpy.typing import NDArray
 from tests.real.runner.harness import OraclePolicy, events, mean_displacement, plan_for
 
+import gelflow.real
 from gelflow.clock import ScaledClock
 from gelflow.errors import SafetyError
 from gelflow.geometry import Pose
@@ -18,8 +21,16 @@ from gelflow.hardware_mocks.robot import MockRobot
 from gelflow.mock_lab.lab import lab_for
 from gelflow.observation import FlowMap
 from gelflow.real.runner.insertion.attempt import Attempt, Insertion
+from gelflow.real.runner.insertion.held_part import HeldPart
+from gelflow.real.runner.insertion.insertion_runner import InsertionRunner
+from gelflow.real.runner.lab import Lab
+from gelflow.real.runner.lab_file import load_lab
 from gelflow.real.runner.motion_executor import MotionExecutor, PartLost
-from gelflow.real.runner.run_plan import run_insertions
+from gelflow.real.runner.phases import Phase
+from gelflow.real.runner.run_plan import dry_run, run_insertions
+from gelflow.real.runner.supervisor import Supervisor
+from gelflow.real.runner.touch.grasp_check import nominal_thresholds
+from gelflow.real.runner.touch.guarded_motion import Contact
 from gelflow.session.reader import SessionReader
 from gelflow.task import INSERTION
 
@@ -176,6 +187,66 @@ def test_a_run_begins_with_a_motion_straight_up(robot: MockRobot, tmp_path: Path
     up, sideways = np.array(moves) - start
     assert up[2] > 1e-3 and np.abs(up[:2]).max() < 1e-4
     assert sideways[0] == pytest.approx(3e-3, abs=1e-4) and sideways[2] == pytest.approx(up[2], abs=1e-4)
+
+
+EXAMPLE = load_lab(Path(gelflow.real.__path__[0]) / "runner" / "lab_example.toml")
+
+
+def test_a_hand_over_below_the_start_of_an_attempt_is_refused() -> None:
+    """A part would be moved down to it after contact, onto the rim."""
+    for height, refused in ((0.020, True), (0.0295, True), (0.0296, False)):
+        cell: Any = SimpleNamespace(
+            lab=replace(EXAMPLE, part=replace(EXAMPLE.part, load_height=height)), clock=None, recorder=None
+        )
+        parts: dict[str, Any] = {"policy": None, "motion": None, "operator": None}
+        with pytest.raises(SafetyError, match=r"raise part\.load_height") if refused else nullcontext():
+            InsertionRunner(cell, task=INSERTION, **parts)
+
+
+def held_part(lab: Lab, height: float, move: Callable[..., Any]) -> HeldPart:
+    """A held part whose lower face is at `height` [m], and whose motions are calls of `move(target)`."""
+    part: Any = HeldPart.__new__(HeldPart)
+    supervisor = Supervisor(lab)
+    for phase in (Phase.LOAD, Phase.APPROACH, Phase.DESCEND):
+        supervisor.phases.enter(phase)
+    part._motion = SimpleNamespace(supervisor=supervisor, pose=lambda: lab.gripper_at(0.0, 0.0, 0.0, height))
+    part._guard = SimpleNamespace(move=lambda target, **_: move(target), rest=lambda: None)
+    part._recorder = SimpleNamespace(event=lambda *_: None)
+    part._lab, part._task, part.thresholds = lab, INSERTION, nominal_thresholds(lab.descent)
+    part._pose = lambda planar_pose, height: lab.gripper_at(0.0, 0.0, 0.0, height)
+    part.height_offset, part._deadline, part._baseline = 0.0, np.inf, np.zeros((2, 2))
+    return part  # type: ignore[no-any-return]
+
+
+def test_a_retreat_never_moves_down() -> None:
+    targets: list[Pose] = []
+    held_part(EXAMPLE, 0.030, targets.append).retreat(0.027)
+    assert not targets
+    held_part(EXAMPLE, 0.026, targets.append).retreat(0.027)
+    assert Supervisor(EXAMPLE).hole_coordinates(targets[0])[3] == pytest.approx(0.027)
+
+
+def test_contact_at_a_low_rim_is_no_floor_where_the_workspace_ends_above_it() -> None:
+    """The rim is 4 mm lower than taught, and the lowest target 0.2 mm below it."""
+    lab = replace(
+        EXAMPLE,
+        part=replace(EXAMPLE.part, insert_to=0.0206),
+        workspace=replace(EXAMPLE.workspace, height_min=0.0205),
+    )
+    reading: Any = SimpleNamespace(shear=0.3, frame=SimpleNamespace(stamp=0.0))
+    part = held_part(lab, 0.0208, lambda target: Contact(reading, 0.3))
+    part.height_offset = -0.004
+    assert part.lower((0.0, 0.0, 0.0)) is reading  # None: on the floor, which counts as inserted
+
+
+def test_a_run_refuses_a_target_outside_the_workspace_as_a_dry_run_does(robot: MockRobot, tmp_path: Path) -> None:
+    lab = lab_for(robot)
+    lab = replace(lab, arm=replace(lab.arm, max_speed=lab.descent.speed / 2))
+    for run in (dry_run, run_insertions):
+        with pytest.raises(SafetyError, match=r"target refused: speed 0\.5 mm/s is outside 0 to 0\.25 mm/s"):
+            run(plan_for(robot, tmp_path, OraclePolicy(robot), lab=lab))
+        (tmp_path / "session.mcap").unlink()
+    assert robot.arm.report.largest_step < 1e-9
 
 
 class InterruptedGripper:

@@ -56,6 +56,13 @@ def test_saved_lab_file_round_trip(tmp_path: Path) -> None:
     assert load_lab(tmp_path / "deep" / "lab.toml") == lab
 
 
+def test_a_saved_lab_file_with_any_name_is_read_back(tmp_path: Path) -> None:
+    lab = load_lab(EXAMPLE)
+    lab = dataclasses.replace(lab, gripper=dataclasses.replace(lab.gripper, address="serial:/tmp/\U0001f916\x7f/pty"))
+    save_lab(lab, tmp_path / "lab.toml", title="round trip")
+    assert load_lab(tmp_path / "lab.toml") == lab
+
+
 @pytest.mark.parametrize(
     ("old", "new", "expected"),
     [
@@ -109,11 +116,28 @@ def test_saved_lab_file_round_trip(tmp_path: Path) -> None:
         ("pixels_per_mm = 15.7", 'calibration = "none.json"', "lab.toml, cameras.left: cannot read"),
         ("# stale_pose = 0.020", "stale_pose = 0", "lab.toml: limits.stale_pose must be 0.008 to 0.1 s, got 0"),
         ("format = 1", "format = 1\ncameras = 3", "not valid TOML"),
+        ("serial:/dev/ttyUSB0", "tcp:192.168.1..20:1000", "lab.toml, gripper: a TCP address needs a valid host and a"),
+        ("serial:/dev/ttyUSB0", "tcp:192.168.1.20", "gripper: address 'tcp:192.168.1.20' is neither tcp:HOST:PORT"),
+        ("http://192.168.1.30", "http://192.168.1..30", "cameras.left: camera source: expected http://HOST:PORT/path"),
+        ('# host = "0.0.0.0" ', 'host = "a..b" #', "lab.toml, arm: host must be an IPv4 address of this computer or"),
+        ('# robot = "" ', 'robot = "::1" #', "lab.toml, arm: robot must be the IP address of the controller (IPv4)"),
+        ("# height_min = 0.001", "height_min = 0.020", "insert_to must be at least workspace.height_min, got"),
+        ("# load_height = 0.040", "load_height = 0.070", "load_height must be at most workspace.height_max, got"),
+        (
+            "# speed = 0.02 ",
+            "speed = 0.005 #",
+            "gripper.speed 0.005 m/s is too low: 50 mm take 10.5 s, and limits.gripper_motion is 6.0 s",
+        ),
     ],
 )
 def test_errors_name_the_key(tmp_path: Path, example: str, old: str, new: str, expected: str) -> None:
     assert old in example
     assert expected in refused(tmp_path, example.replace(old, new, 1))
+
+
+def test_a_latency_at_which_every_image_is_stale_is_refused(tmp_path: Path, example: str) -> None:
+    text = example.replace("# latency = 0.0 ", "latency = 0.1 #").replace("# stale_frame = 0.250", "stale_frame = 0.1")
+    assert "cameras.left.latency must be below limits.stale_frame, got 0.1 and 0.1 s" in refused(tmp_path, text)
 
 
 def with_value(text: str, key: str, value: str) -> str:

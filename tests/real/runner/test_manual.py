@@ -130,6 +130,33 @@ def test_a_stopped_run_is_cleared_by_jog_open_and_home(robot: MockRobot, tmp_pat
     assert not robot.gripper.fast_stopped
 
 
+@pytest.mark.parametrize(("width", "opened"), [(0.040, 0.060), (0.070, 0.075), (0.108, 0.110)])
+def test_a_held_part_that_is_wider_than_open_width_is_released(
+    monkeypatch: pytest.MonkeyPatch, width: float, opened: float
+) -> None:
+    questions: list[str] = []
+
+    def agreed(question: str, state: object) -> bool:
+        questions.append(question)
+        return True
+
+    with connected() as (gripper, _, plant, record):
+        monkeypatch.setattr(gripper_actions, "_gripper", lambda session: contextlib.nullcontext(gripper))
+        session: Any = SimpleNamespace(
+            attended=True,
+            agreed=agreed,
+            lab=SimpleNamespace(gripper=SimpleNamespace(open_width=0.06, speed=0.4)),
+        )
+        for action in (gripper_actions.open_fingers, gripper_actions.home):
+            gripper.home(part_removed=True)
+            plant.set_part(width)
+            gripper.grasp(width=width, speed=0.4, force=20)
+            assert action(session)["done"]
+            released = next(values for name, values in reversed(record.commands) if name == "release")
+            assert released["width"] == pytest.approx(opened, abs=1e-4)
+    assert f"The fingers open from {1e3 * width:.1f} to {1e3 * opened:.1f} mm. Open?" in questions[0]
+
+
 def test_home_releases_a_held_part_first(monkeypatch: pytest.MonkeyPatch) -> None:
     """The device accepts no other motion while it holds a part."""
     questions: list[str] = []

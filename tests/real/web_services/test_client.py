@@ -118,7 +118,7 @@ def test_invalid_values_are_errors(value: object) -> None:
 
 
 @pytest.mark.parametrize(
-    "address", ["192.168.125.1", "https://a", "http://", "http://a/rw", "http://u:p@a", "http://a:x"]
+    "address", ["192.168.125.1", "https://a", "http://", "http://a/rw", "http://u:p@a", "http://a:x", "http://a..b"]
 )
 def test_invalid_addresses_are_refused(address: str) -> None:
     with pytest.raises(UsageError, match="web services"):

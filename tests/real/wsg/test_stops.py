@@ -1,5 +1,7 @@
 """WSG-50 driver: stops, faults, dry runs and recording errors, with the mock on a pty and on TCP."""
 
+import os
+import signal
 import threading
 import time
 from collections.abc import Mapping
@@ -20,6 +22,7 @@ from tests.real.wsg.harness import (
 )
 
 from gelflow.errors import PeerError, PeerRefused, PeerTimeout, SafetyError
+from gelflow.interrupts import Interrupted, interruptible
 from gelflow.protocols import GripperState
 from gelflow.real.transport import transport_for
 from gelflow.real.wsg.codec import Packet
@@ -149,6 +152,23 @@ def test_unannounced_disconnect_leaves_fast_stop_and_the_held_part() -> None:
             second.home(part_removed=True)
 
 
+def test_a_signal_during_the_disconnect_is_raised_after_it() -> None:
+    """An unannounced disconnect raises FAST STOP."""
+
+    def interrupt(name: str, values: Mapping[str, float]) -> None:
+        if name == "stop":
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with mock() as (server, _):
+        transport = transport_for(server.addresses[1], clock=CLOCK)
+        gripper = WsgGripper(transport, clock=CLOCK, config=CONFIG, on_command=interrupt)
+        gripper.connect()
+        with pytest.raises(Interrupted), interruptible():
+            gripper.close()
+        time.sleep(0.2)
+        assert not server.fast_stopped
+
+
 def test_dry_run_sends_no_motion() -> None:
     with mock() as (server, plant):
         with WsgGripper(transport_for(server.addresses[1], clock=CLOCK), clock=CLOCK, config=CONFIG) as gripper:
@@ -167,9 +187,10 @@ def test_dry_run_sends_no_motion() -> None:
             gripper.stop()
             with pytest.raises(SafetyError):
                 gripper.move(width=0.2, speed=0.1)
+            gripper.acknowledge_fault()
         relay.close()
-        assert record.names == ["home", "grasp", "release", "move", "stop", "disconnect"]
-        assert not MOTION_IDS & set(relay.ids()) and Command.SET_FORCE_LIMIT not in relay.ids()
+        assert record.names == ["home", "grasp", "release", "move", "stop", "acknowledge fault", "disconnect"]
+        assert not (MOTION_IDS | {Command.SET_FORCE_LIMIT, Command.ACKNOWLEDGE}) & set(relay.ids())
         assert plant.gripper_state()[0] == pytest.approx(width)
         assert not server.fast_stopped
 
