@@ -17,7 +17,7 @@ from gelflow.perception.tracker import MarkerTracker, TrackerConfig, TrackingRes
 # differs from the median over the grid by at most 5 % for a tilt of 8° about both axes, seen from 25 mm or more, and a
 # lens that moves the corners by 10 %.
 TOLERANCE = 0.1
-_SPACINGS = (0.01, 1000.0)  # between which markers may be apart [mm]; a scale in other units gives other values
+_SPACINGS = (0.01, 50.0)  # between which markers may be apart [mm]; a scale in mm/px gives more
 _ROW_TOLERANCE = 0.4  # of the distance of a marker from its calibrated position / pitch; at 0.5 rows are exchanged
 _MIN_VISIBLE = 0.8  # fraction of valid markers of the visible part, at rest
 _MIN_PART = 0.4  # smallest visible part of the printed grid for which the success of the policy was measured
@@ -71,7 +71,7 @@ def check_scale(mount: CameraMount, rest: TrackingResult) -> None:
 def check_uniform_scale(pixels_per_mm: float, spacing: float, pitch: float = 0.0) -> None:
     """Raise UsageError when the spacing of the markers [px] by a uniform scale is impossible, or not the pitch [mm].
 
-    It must be within 0.01 to 1000 mm, and within 10 % of the pitch, which is 0 where it is not known.
+    It must be within 0.01 to 50 mm, and within 10 % of the pitch, which is 0 where it is not known.
     """
     smallest, largest = _SPACINGS
     if not smallest * pixels_per_mm <= spacing <= largest * pixels_per_mm:

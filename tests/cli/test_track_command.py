@@ -261,8 +261,8 @@ def test_unreadable_images_are_skipped_and_shown(tmp_path: Path, capsys: pytest.
         (["--images", "0"], "--images must be at least 1"),
         (["--magnify", "inf"], "--magnify must be above 0 and at most 1e+06, got inf"),
         (["--magnify", "nan"], "--magnify must be above 0 and at most 1e+06, got nan"),
-        (["--pixels-per-mm", "1e-9"], "a scale of 1e-09 px/mm is impossible for markers 34."),
-        (["--pixels-per-mm", "1e9"], "must be within 0.01 to 1000 mm; correct --pixels-per-mm"),
+        (["--pixels-per-mm", "0.0333"], "a scale of 0.0333 px/mm is impossible for markers 34."),
+        (["--pixels-per-mm", "1e9"], "must be within 0.01 to 50 mm; correct --pixels-per-mm"),
         (["--pixels-per-mm", "20", "--profile", "mine.toml"], "pitch of the profile is 2.2 mm: --pixels-per-mm 15."),
     ],
 )
