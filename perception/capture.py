@@ -74,9 +74,8 @@ class Capture:
         finally:
             capture.release()
         number = stamps.number
-        missing = expected - max(
-            number, stamps.latest * rate + 1
-        )  # by time too: a container may only estimate the number
+        # By time too: a container may only estimate the number.
+        missing = expected - max(number, stamps.latest * rate + 1)
         if number and missing > max(_MISSING, _MISSING_SHARE * expected):
             raise PeerError(
                 f"video {self.text} ends after {number} of {expected:.0f} images: it is truncated or damaged"

@@ -129,8 +129,9 @@ class EgmLoop:
         if sender == self._robot:
             return True
         generator = self._generator
-        silent = stamp - generator.received > self._config.silence and not generator.following
-        return sender[0] == self._robot[0] and silent and not generator.latched
+        silent = stamp - generator.received > self._config.silence
+        stopped = bool(generator.latched) or EgmFlag.FOLLOWING in generator.flags
+        return sender[0] == self._robot[0] and silent and not stopped
 
     def _answer(self) -> None:
         stamp = self._clock.now()

@@ -68,11 +68,6 @@ class ReferenceGenerator:
         return self._target
 
     @property
-    def following(self) -> bool:
-        """Whether the controller follows references."""
-        return self._following
-
-    @property
     def received(self) -> float:
         """Robot time of the newest feedback [s]; −inf before the first one."""
         return self._received

@@ -16,7 +16,7 @@ from gelflow.sim.scene import Scene, load_scene
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.tasks.randomization import Randomization
 from gelflow.sim.tasks.sensor_model import SensorModel
-from gelflow.sim.tasks.task_batch import Array, Mask, SceneOptions, TaskBatch, check_scene_options
+from gelflow.sim.tasks.task_batch import Array, Mask, SceneOptions, TaskBatch, check_option_names
 from gelflow.task import TaskDescription
 
 
@@ -88,7 +88,7 @@ class ControlTask(TaskBatch):
             action_space=Box(-1, 1, (actions,), np.float32),
             privileged=privileged,
         )
-        check_scene_options(self, options)
+        check_option_names(description.name, type(self), options)
         preset, friction = options.get("preset"), options.get("friction")
         loaded = load_scene(scene, preset=preset, friction=friction, overrides=overrides)
         self.scene = adapt_step(loaded, description.control_period)

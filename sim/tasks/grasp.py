@@ -25,8 +25,8 @@ from gelflow.sim.tasks.task_batch import (
     Array,
     Mask,
     SceneOptions,
+    check_option_names,
     check_options,
-    check_scene_options,
     option_rows,
 )
 from gelflow.sim.trajectory import Trajectory
@@ -140,7 +140,7 @@ class Grasp(AttemptTask):
             privileged=2,
             attempts=task.attempts,
         )
-        check_scene_options(self, options)
+        check_option_names(task.name, type(self), options)
         self.randomization = randomization
         self.bar = Bar(blocks)
         self.scene = _scene(task, options, moving_load)

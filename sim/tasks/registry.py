@@ -9,7 +9,7 @@ from typing import Any
 from gelflow.errors import UsageError
 from gelflow.sim.arguments import check_type, shown
 from gelflow.sim.tasks.randomization import Randomization
-from gelflow.sim.tasks.task_batch import TaskBatch
+from gelflow.sim.tasks.task_batch import TaskBatch, check_option_names
 from gelflow.task import INSERTION, InsertionTask, TaskDescription
 from gelflow.toml_tables import suggestion
 
@@ -56,11 +56,7 @@ def make_task(name: str, num_envs: int, **options: Any) -> TaskBatch:
         options.pop("randomization", None)
     else:
         check_type("randomization", options["randomization"], Randomization, "the name of a table or a Randomization")
-    parameters = inspect.signature(batch_class).parameters
-    unknown = sorted(options.keys() - parameters.keys())
-    # A class that takes others checks them itself.
-    if unknown and all(parameter.kind is not parameter.VAR_KEYWORD for parameter in parameters.values()):
-        raise UsageError(f"{name} has no option {unknown[0]!r}; {suggestion(unknown[0], parameters)}")
+    check_option_names(name, batch_class, options)
     batch = batch_class(num_envs, **options)
     assert isinstance(batch, TaskBatch)
     return batch

@@ -169,13 +169,16 @@ class TaskBatch(ABC):
         return mask
 
 
-def check_scene_options(batch: TaskBatch, options: Mapping[str, Any]) -> None:
-    """Raises UsageError for a name in `options`, the `SceneOptions` of a batch, that is not one of them."""
-    parameters = inspect.signature(type(batch)).parameters.values()
+def check_option_names(task: str, batch_class: type[TaskBatch], options: Mapping[str, Any]) -> None:
+    """Raises UsageError for a name in `options` that is none of the class's options, all of which have a default.
+
+    Every class takes the `SceneOptions`.
+    """
+    parameters = inspect.signature(batch_class).parameters.values()
     valid = {given.name for given in parameters if given.default is not given.empty} | {*SceneOptions.__annotations__}
     for name in options:
-        if name not in SceneOptions.__annotations__:
-            raise UsageError(f"{batch.description.name} has no option {name!r}; {suggestion(name, valid)}")
+        if name not in valid:
+            raise UsageError(f"{task} has no option {name!r}; {suggestion(name, valid)}")
 
 
 def check_options(task: str, options: Mapping[str, Any], known: Mapping[str, str]) -> None:

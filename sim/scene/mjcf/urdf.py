@@ -54,39 +54,17 @@ def _check_floating(robot: ElementTree.Element, path: Path) -> None:
 
 
 def parse_urdf(robot: ElementTree.Element, path: Path) -> Any:
-    """The file as a mujoco.MjSpec, with mesh files resolved, inertia repaired and motors added.
-
-    MuJoCo names a mesh by its file name and takes two files of one name in different folders for one mesh. All but the
-    first are therefore read under another name.
-    """
-    addresses: dict[str, str] = {}  # by the name that MuJoCo reads
-    stems: dict[str, str] = {}
-    for mesh in robot.iter("mesh"):
-        address = mesh.get("filename", "")
-        stem, suffix = Path(address).stem, Path(address).suffix
-        alias = address
-        while stems.setdefault(stem, address) != address:
-            stem += "_"
-            alias = stem + suffix
-        mesh.set("filename", alias)
-        addresses[alias] = address
-    if all(alias == address for alias, address in addresses.items()):
-        spec = mujoco.MjSpec.from_file(str(path))
-    else:
+    """The file as a mujoco.MjSpec, with mesh files resolved, inertia repaired and motors added."""
+    if addresses := _rename_meshes(robot):
         spec = mujoco.MjSpec.from_string(ElementTree.tostring(robot, encoding="unicode"))
         spec.modelfiledir = str(path.parent)
-    for mesh in spec.meshes:
-        mesh.file = addresses.get(mesh.file, mesh.file)
-    _complete(spec, robot, path)
-    return spec
-
-
-def _complete(spec: Any, robot: ElementTree.Element, path: Path) -> None:
+    else:
+        spec = mujoco.MjSpec.from_file(str(path))
     spec.compiler.fusestatic = False  # keep the link frames: a pad may refer to them as sites
     if spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO:
         spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE  # URDF has no densities
     for mesh in spec.meshes:
-        mesh.file = _mesh_file(mesh.file, path)
+        mesh.file = _mesh_file(addresses.get(mesh.file, mesh.file), path)
         if Path(mesh.file).suffix.lower() == ".dae" and (path.parent / mesh.file).is_file():
             _insert_triangles(mesh, read_collada(path.parent / mesh.file))
     for body, moves in _links(spec.worldbody):
@@ -96,6 +74,26 @@ def _complete(spec: Any, robot: ElementTree.Element, path: Path) -> None:
     mimics = _mimic_joints(robot, path)
     _couple(spec, mimics)
     _add_motors(spec, robot, path, without=mimics)
+    return spec
+
+
+def _rename_meshes(robot: ElementTree.Element) -> dict[str, str]:
+    """Give meshes different names where only their folders differ; the addresses by the new names.
+
+    MuJoCo names a mesh by its file, and would use the first of two files of one name for both.
+    """
+    renamed: dict[str, str] = {}
+    taken: dict[str, str] = {}  # address by the name of the mesh
+    for mesh in robot.iter("mesh"):
+        address = mesh.get("filename", "")
+        stem = Path(address).stem
+        while taken.setdefault(stem, address) != address:
+            stem += "_"
+        if stem != Path(address).stem:
+            name = stem + Path(address).suffix
+            renamed[name] = address
+            mesh.set("filename", name)
+    return renamed
 
 
 def compile_urdf(spec: Any, path: Path) -> Any:
@@ -269,7 +267,7 @@ def _add_motors(spec: Any, robot: ElementTree.Element, path: Path, without: Cont
     interface of ROS, within the effort limit of the joint. Raises UsageError for a joint that the file does not have.
     """
     driven = _driven_joints(robot)
-    all_joints = next(robot.iter("transmission"), None) is None and next(robot.iter("ros2_control"), None) is None
+    all_joints = robot.find(".//transmission") is None and robot.find(".//ros2_control") is None
     names = {joint.get("name", "") for joint in robot.findall("joint")}
     if unknown := sorted(driven.keys() - names):
         raise UsageError(f"{path}: a motor drives joint {unknown[0]!r}, which the file does not have")

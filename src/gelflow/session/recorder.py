@@ -238,15 +238,13 @@ class SessionRecorder:
         return self if self._thread is not None else self.open()
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
-        interrupts.defer()
-        try:
-            self.close()
-        except GelflowError as failure:
-            if error is None:
-                raise
-            error.add_note(str(failure))  # the first error is the cause
-        finally:
-            interrupts.resume()
+        with interrupts.deferred():
+            try:
+                self.close()
+            except GelflowError as failure:
+                if error is None:
+                    raise
+                error.add_note(str(failure))  # the first error is the cause
 
     # Queue
 
