@@ -1,6 +1,7 @@
 """Forces on a gel from the displacements of its markers, image by image."""
 
 import math
+import threading
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,6 +25,9 @@ _PRESSED = 0.1  # cells with this share of the largest normal load count as cont
 # Added to the deviations for errors of the layer model and of the contact's assumed shape, relative to the value;
 # measured, see docs/guide/sensing/forces.md.
 _SHEAR_ERROR, _NORMAL_ERROR, _MOMENT_ERROR = 0.015, 0.06, 0.06
+_blas_limit = (
+    threading.Lock()
+)  # held while the number of threads of the linear algebra, one for the process, is limited
 
 
 def check_force_grid(rows: int, cols: int) -> None:
@@ -116,7 +120,7 @@ class ForceEstimator:
             self._fit = None
             return None
         # The matrices are small: threads of the linear algebra would only wait for each other.
-        with self._blas.limit(limits=1):
+        with _blas_limit, self._blas.limit(limits=1):
             return self._estimate(displacement, valid, measured)
 
     def _estimate(self, displacement: Array, valid: NDArray[np.bool_], measured: Array) -> ForceEstimate:

@@ -91,6 +91,11 @@ def read_samples(estimates: Path, measured: Path) -> ForceSamples:
         raise UsageError(
             f"{measured} needs the column stamp or image, and normal_n or shear_n [N]; it has {', '.join(columns)}"
         )
+    if {"stamp", "image"} <= columns:
+        raise UsageError(
+            f"{measured} has the columns stamp and image; give one: image for forces that were measured in these "
+            "images, stamp for forces between whose rows is interpolated"
+        )
     in_time = "stamp" in columns
     known = [_measurements(table, name, measured, in_time=in_time) for name in ("normal_n", "shear_n")]
     if in_time:

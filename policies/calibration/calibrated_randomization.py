@@ -27,6 +27,8 @@ SAMPLES = 256
 _LIMIT = 3**0.5  # of a whitened parameter [sd]: three times the range of a randomization that is the prior
 _NOISE = 2.0  # factor by which the estimate of the noise may be wrong
 _DIGITS = 5  # significant
+_SIGNED = ("grasp_height", "turn_left", "turn_right")
+_POSITIVE = (*QUANTITIES, "gain_ratio")  # except the signed ones; the others may be zero
 
 
 def calibrated_randomization(result: Calibration) -> dict[str, Any]:
@@ -63,8 +65,10 @@ def _samples(result: Calibration, rng: np.random.Generator) -> dict[str, Array]:
     values[ratio.name] = ratio.value(points @ direction)
     gain = np.sqrt(values["gain_left"] * values["gain_right"])
     values |= {name: values[name] * gain for name in ("marker_kn", "marker_ks")}
-    pads = ReadingModel(result.recordings, threads=1).pads
-    values["crosstalk"] = np.maximum(pads.crosstalk_on_grid(values["crosstalk"]), 0.0)
+    recordings = result.recordings
+    flow = recordings.flow.reshape(len(recordings), -1, 2)
+    pads = ReadingModel(recordings, threads=1).pads
+    values["crosstalk"] = pads.crosstalk_on_grid(values["crosstalk"], flow, recordings.used)
     return {name: values[name] for name in DEFAULT_RANDOMIZATION if name in values and name in confirmed}
 
 
@@ -84,21 +88,41 @@ def read_randomization(path: Path, task: InsertionTask) -> dict[str, Any]:
         if number == FORMAT:
             part, found = report["part"], report["randomization"]
             options: dict[str, Any] = {
-                "ranges": {str(name): [float(low), float(high)] for name, (low, high) in found["ranges"].items()},
-                "samples": {str(name): [float(v) for v in values] for name, values in found["samples"].items()},
+                "ranges": {str(name): _numbers([low, high]) for name, (low, high) in found["ranges"].items()},
+                "samples": {str(name): _numbers(values) for name, values in found["samples"].items()},
             }
+            maps = dict(report.get("flow_maps", {}))
     except OSError as error:
         raise UsageError(f"cannot read the calibration {path}: {error.strerror}") from error
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+    except (ValueError, KeyError, TypeError, AttributeError, ArithmeticError, RecursionError):
         raise UsageError(f"{path} is not the report.json of gelflow calibrate") from None
     if number != FORMAT:
         raise UsageError(f"{path}: format must be {FORMAT}, got {number!r}; repeat gelflow calibrate")
-    if not options["samples"]:
-        raise UsageError(f"{path}: the recordings determine nothing about the randomization; see record_next there")
     if part != task.part.to_json():
         options["samples"].pop("grasp_height", None)
+    if not options["samples"]:
+        raise UsageError(f"{path}: {_why_nothing(maps)}; see record_next there")
     try:
         DEFAULT_RANDOMIZATION.replace(**options["ranges"]).drawn_from(options["samples"])
     except UsageError as error:
         raise UsageError(f"{path}: {error}") from None
+    for name, values in options["samples"].items():
+        if name not in _SIGNED and (min(values) < 0 or (min(values) == 0 and name in _POSITIVE)):
+            raise UsageError(f"{path}: samples of {name} must be positive, got {min(values):g}")
     return options
+
+
+def _why_nothing(flow_maps: Any) -> str:
+    """Why a report with these results for its flow maps has no samples."""
+    if not flow_maps.get("converged", True):
+        return "the searches of the fit do not agree"
+    if not flow_maps.get("reproduced", True):
+        return "the simulation with the fitted parameters does not reproduce the recordings"
+    return "the recordings determine nothing about the randomization"
+
+
+def _numbers(values: Any) -> list[float]:
+    """A list of JSON numbers; raises TypeError for anything else."""
+    if not isinstance(values, list) or any(isinstance(v, bool) or not isinstance(v, int | float) for v in values):
+        raise TypeError(values)
+    return [float(value) for value in values]

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import SimulationError
+from gelflow.policies.calibration.model.fidelity import ROUGH
 from gelflow.policies.calibration.model.parameters import FARTHEST
 from gelflow.policies.calibration.poses import INSERTED_POSE_SPREAD, draw_poses, prior_cost_of_all
 from gelflow.policies.calibration.problem import Problem
@@ -28,12 +29,12 @@ _MODEL_ERROR = 0.04  # that residuals allow for, relative to the flow maps
 
 
 def rough_problem(recordings: Recordings, *, threads: int | None = None) -> Problem:
-    """The problem of a global search, in the rough simulation of `ShearModel`.
+    """The problem of a global search, in the rough simulation.
 
-    Its flow maps differ by some thousandths in the median, far less than the error that is allowed for. The few guesses
-    that need many iterations would take most of the time, so they fail, until more than half of an ensemble need them.
+    Most of its flow maps differ by less than the error that is allowed for. The few guesses that need many iterations
+    would take most of the time, so they fail, until more than half of an ensemble need them.
     """
-    problem = Problem(recordings, threads=threads, rough=True)
+    problem = Problem(recordings, threads=threads, fidelity=ROUGH)
     problem.allow_for(model_error=_MODEL_ERROR)
     return problem
 

@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 # Ensembles and rounds of local searches, before and after the poses of all insertions are searched once more. Of an
 # ensemble: the error of the model that it allows for, and its spread around the best member, relative to the prior.
 _BEFORE = ((0.04, 0.2), (MODEL_ERROR, 0.1)), 1
-_AFTER = ((MODEL_ERROR, 0.05), (MODEL_ERROR, 0.02)), 3
+_AFTER = ((MODEL_ERROR, 0.05),), 2
 _SUFFICIENT = 1.0  # decrease of the cost in a round below which no other follows
 _AS_GOOD = 1.3  # starts whose residuals are larger than the best ones by this factor do not count
 
@@ -174,8 +174,10 @@ def _fit_start(recordings: Recordings, seed: int, index: int, settings: FitSetti
 
 def _searched(problem: Problem, rng: np.random.Generator, settings: FitSettings) -> StartResult:
     point, poses = search_globally(rough_problem(problem.recordings, threads=1), settings.members, rng)
-    point, poses = _improve(problem, point, poses, rng, settings, *_BEFORE)
-    point, poses = better_poses(problem, point, poses, rng, members=settings.nearby, count=settings.poses)
+    coarse = problem.coarse
+    point, poses = _improve(coarse, point, poses, rng, settings, *_BEFORE)
+    point, poses = better_poses(coarse, point, poses, rng, members=settings.nearby, count=settings.poses)
+    problem.errors = coarse.errors
     point, poses = _improve(problem, point, poses, rng, settings, *_AFTER)
     chi = problem.errors.chi(problem.residuals(point, poses)[0])
     return StartResult(

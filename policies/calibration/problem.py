@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from gelflow.errors import UsageError
 from gelflow.geometry import compose_planar
 from gelflow.policies.calibration.model.error_model import ErrorModel
+from gelflow.policies.calibration.model.fidelity import COARSE, EXACT, Fidelity
 from gelflow.policies.calibration.model.reading_model import ReadingModel
 from gelflow.policies.calibration.model.shear_model import Descents
 from gelflow.policies.calibration.recordings import Recordings
@@ -39,7 +40,7 @@ class Problem:
     no useful gradient and are searched (`gelflow.policies.calibration.poses`).
     """
 
-    def __init__(self, recordings: Recordings, *, threads: int | None = None, rough: bool = False) -> None:
+    def __init__(self, recordings: Recordings, *, threads: int | None = None, fidelity: Fidelity = EXACT) -> None:
         if not len(recordings):
             raise UsageError("the recordings have no attempt with contact: there is nothing to fit")
         if not recordings.used.reshape(2, -1).any(1).all():
@@ -47,11 +48,21 @@ class Problem:
                 "no marker of a pad can be compared: its camera shows too few lines of the printed grid, or all of its "
                 "markers are too noisy"
             )
-        self.readings = ReadingModel(recordings, threads=threads, rough=rough)
+        self.readings = ReadingModel(recordings, threads=threads, fidelity=fidelity)
+        self._coarse_readings = self.readings
+        if fidelity == EXACT:
+            self._coarse_readings = ReadingModel(recordings, threads=threads, fidelity=COARSE)
         self.fitted = self.readings.fitted
         self._scale = self.readings.scale
         self._set_recordings(recordings)
         self.errors = ErrorModel(recordings.noise() / self._scale, self._rms(), recordings.used)
+
+    @property
+    def coarse(self) -> "Problem":
+        """The same problem in the coarse simulation."""
+        result = copy.copy(self)
+        result.readings = self._coarse_readings
+        return result
 
     def of(self, insertion: int) -> "Problem":
         """The same problem with the attempts of one insertion only."""

@@ -43,15 +43,19 @@ class Recordings:
     height_spread: float = 0.2e-3 / math.sqrt(3)  # standard deviation of the start height of an attempt [m]
     # Attempts that were motions of a plan, with a stop shear of their own, (n,); empty: none.
     planned: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
-    # Markers that are compared, (pads * rows * cols,); empty: those that are not noisy.
+    # Markers whose values are measured, not interpolated from others, (pads * rows * cols,); empty: all.
+    measured: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    # Markers that are compared, (pads * rows * cols,); empty: the measured ones that are not noisy.
     used: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
     given_noise: float | None = None  # result of `noise`; None: it is estimated
 
     def __post_init__(self) -> None:
         if not len(self.planned):
             object.__setattr__(self, "planned", np.zeros(len(self.insertion), dtype=bool))
+        if not len(self.measured):
+            object.__setattr__(self, "measured", np.ones(math.prod(self.flow.shape[1:4]), dtype=bool))
         if not len(self.used):
-            object.__setattr__(self, "used", ~self._noisy_markers())
+            object.__setattr__(self, "used", self.measured & ~self._noisy_markers())
 
     def __len__(self) -> int:
         return len(self.insertion)
@@ -76,26 +80,40 @@ class Recordings:
         """Standard deviation of the difference of two readings of a marker, in `unit`.
 
         From the second differences of the flow maps across rows and columns, in which smooth fields cancel. The median
-        over the markers of a pad ignores the edges of contacts; the lower quartile over attempts and pads ignores the
-        maps of firm contacts, which are not smooth.
+        over the measured markers of a pad ignores the edges of contacts; the lower quartile over attempts and pads
+        ignores the maps of firm contacts, which are not smooth.
         """
         if self.given_noise is not None:
             return self.given_noise
-        of_pads = np.median(np.abs(_second_differences(self.flow)).reshape(math.prod(self.flow.shape[:2]), -1), axis=1)
-        return float(np.quantile(of_pads, 0.25) / _MEDIAN_SIZE / self._roughness())
+        differences = np.abs(_second_differences(self.flow))
+        whole = self._measured_neighbourhoods()
+        roughness = [self._roughness(of_pad) for of_pad in whole]
+        sizes = [
+            np.median(differences[:, pad, of_pad].reshape(len(self.flow), -1), axis=1) * (roughness[0] / roughness[pad])
+            for pad, of_pad in enumerate(whole)
+        ]
+        return float(np.quantile(sizes, 0.25) / _MEDIAN_SIZE / roughness[0])
 
-    def _roughness(self) -> float:
+    def _measured_neighbourhoods(self) -> NDArray[np.bool_]:
+        """Where a marker and its eight neighbours are measured, (pads, rows - 2, cols - 2); on a pad without: all."""
+        _, pads, rows, cols, _ = self.flow.shape
+        squares = np.lib.stride_tricks.sliding_window_view(self.measured.reshape(pads, rows, cols), (3, 3), (1, 2))
+        whole = squares.all((3, 4))
+        return np.asarray(np.where(np.any(whole, axis=(1, 2), keepdims=True), whole, True))
+
+    def _roughness(self, where: NDArray[np.bool_]) -> float:
         """Standard deviation of the second differences of markers whose noise has standard deviation 1.
 
         Markers that are interpolated between printed ones share part of their noise, so their second differences have
-        different spreads: the value is that of a normal distribution with the same median magnitude.
+        different spreads: the value is that of a normal distribution with the same median magnitude `where` (rows - 2,
+        cols - 2) the neighbourhood of a marker is measured.
         """
         grid = self.task.grid
         if self.printed is None or self.printed == grid:
             return 6.0
         weights = resampling_weights(self.printed.positions(), grid)
         fields = np.moveaxis(weights.reshape(grid.rows, grid.cols, -1), 2, 0)[:, None, :, :, None]
-        spread = np.sqrt((_second_differences(fields) ** 2).sum(0)).reshape(-1, 1)
+        spread = np.sqrt((_second_differences(fields) ** 2).sum(0))[0, where].reshape(-1, 1)
         sizes = spread * np.abs(scipy.special.ndtri((np.arange(400) + 0.5) / 400))
         return float(np.median(sizes) / _MEDIAN_SIZE / np.sqrt((weights**2).sum(1).mean()))
 

@@ -55,7 +55,7 @@ def read_recordings(
                 visible = visible_markers(described)
             setup = setup or present
             present.check(path, setup, paths[0])
-            found, entered = _attempts(path, session, number)
+            found, entered = _attempts(path, session, number, present.task)
         planned += [described.get("checkpoint") is None] * len(found)
         rows += found
         inserted |= entered
@@ -67,7 +67,7 @@ def read_recordings(
         )
     keep = sorted({row["insertion"] for row in rows})
     new = {old: k for k, old in enumerate(keep)}
-    recordings = Recordings(
+    return Recordings(
         setup.task,
         np.array([new[row["insertion"]] for row in rows], dtype=np.int64),
         np.array([row["planar_pose"] for row in rows], dtype=float),
@@ -82,16 +82,16 @@ def read_recordings(
         grasp_height=setup.grasp_height,
         planned=np.array(planned),
         height_spread=_HEIGHT,
+        measured=_measured(setup, visible),
     )
-    return dataclasses.replace(recordings, used=recordings.used & _measured(recordings, visible))
 
 
-def _measured(recordings: Recordings, visible: Sequence[NDArray[np.bool_]]) -> NDArray[np.bool_]:
+def _measured(setup: "_Setup", visible: Sequence[NDArray[np.bool_]]) -> NDArray[np.bool_]:
     """Markers of the flow maps whose values come from visible printed markers only, (pads * rows * cols,)."""
+    grid = setup.task.grid
     if not visible:
-        return np.ones_like(recordings.used)
-    grid = recordings.task.grid
-    weights = resampling_weights((recordings.printed or grid).positions(), grid)
+        return np.ones(setup.task.sensors * grid.rows * grid.cols, dtype=bool)
+    weights = resampling_weights((setup.printed or grid).positions(), grid)
     return np.concatenate([~(np.abs(weights[:, ~shown]) > 1e-9).any(1) for shown in visible])
 
 
@@ -179,7 +179,7 @@ def _task(path: Path, described: dict[str, Any], part: Part | None) -> Insertion
 
 
 def _attempts(
-    path: Path, session: SessionReader, first: int
+    path: Path, session: SessionReader, first: int, task: InsertionTask
 ) -> tuple[list[dict[str, Any]], dict[int, np.ndarray[Any, Any]]]:
     """Attempts with contact, and planar poses of inserted parts, by insertion counted from `first`."""
     decisions: dict[tuple[int, int], Decision] = {}
@@ -191,20 +191,29 @@ def _attempts(
             continue
         if missing := [key for key in _ATTEMPT_KEYS if key not in value]:
             raise UsageError(f"{path}: a record of /attempt has no {', '.join(missing)}; was it recorded by gelflow?")
-        insertion = first + int(value["insertion"])
-        planar = np.array(value["planar_pose"], dtype=float)
+        try:
+            number, attempt = int(value["insertion"]), int(value["attempt"])
+            planar, depth = np.array(value["planar_pose"], dtype=float), float(value["depth"])
+        except (TypeError, ValueError, OverflowError):
+            raise UsageError(f"{path}: a record of /attempt has a value of another kind: {dict(value)}") from None
+        insertion, name = first + number, f"insertion {first + number}, attempt {attempt}"
+        if planar.shape != (3,) or not np.isfinite(planar).all():
+            raise UsageError(f"{path}: {name}: planar_pose must be three finite numbers, got {value['planar_pose']}")
         if value["outcome"] == "inserted":
             inserted[insertion] = planar
-        decision = decisions.get((int(value["insertion"]), int(value["attempt"])))
+        decision = decisions.get((number, attempt))
         if decision is None or not value["contact"] or value.get("slipped"):
             continue
         if decision.unit != "mm":
             raise UsageError(
                 f"{path}: flow maps are in {decision.unit!r}, expected mm; give the cameras of the lab file a scale"
             )
-        depth = decision.depths[-1] - decision.depths[0] if decision.depths else float(value["depth"])
-        name, flow = f"insertion {insertion}, attempt {decision.attempt}", _vectors(decision)
-        if not (np.isfinite(planar).all() and np.isfinite(depth) and np.isfinite(flow).all()):
+        if decision.depths:
+            depth = decision.depths[-1] - decision.depths[0]
+        flow, shape = _vectors(decision), (task.sensors, task.grid.rows, task.grid.cols, 2)
+        if flow.shape != shape:
+            raise UsageError(f"{path}: {name} has a flow map of shape {flow.shape}, the task of the session {shape}")
+        if not (np.isfinite(depth) and np.isfinite(flow).all()):
             raise UsageError(f"{path}: {name} contains values that are not finite")
         rows.append({"insertion": insertion, "name": name, "planar_pose": planar, "depth": depth, "flow": flow})
     return rows, inserted

@@ -1,6 +1,7 @@
 """Tactile cameras: an MJPEG stream over HTTP, or a UVC device on this computer."""
 
 import contextlib
+import re
 import socket
 import threading
 import time
@@ -37,6 +38,8 @@ def open_camera(
         ).open()
     if source.startswith("uvc:"):
         device = source.removeprefix("uvc:")
+        if device.isdigit() and not re.fullmatch("[0-9]{1,9}", device):
+            raise UsageError(f"camera {name}: the number in {source!r} is not that of a camera")
         chosen = int(device) if device.isdigit() else device
         return UvcCamera(
             chosen, name, clock, timeout=timeout, latency=latency, frozen_after=frozen_after, on_image=on_image

@@ -18,6 +18,8 @@ from gelflow.errors import UsageError
 
 Unit = Literal["N", "mm", "px"]
 
+_ON_EDGE = 1e-5  # distance from the hull of the markers, relative to them, up to which a point counts as inside
+
 # Lower limit of the divisor by unit, about three times the noise of the sources with that unit: for N the largest
 # marker noise of `Randomization` (1 mN), for mm and px the rest jitter that `gelflow track` reports. It keeps the flow
 # map of a frame without contact near zero instead of amplifying the noise.
@@ -60,8 +62,9 @@ class TactileFrame:
         sensors_markers = self.shear.shape[:2]
         if self.shear.ndim != 3 or self.shear.shape[2] != 2:
             raise UsageError(f"shear must have shape (sensors, markers, 2), got {self.shear.shape}")
-        if self.valid.shape != sensors_markers:
-            raise UsageError(f"valid must have shape {sensors_markers}, got {self.valid.shape}")
+        if self.valid.shape != sensors_markers or self.valid.dtype != bool:
+            got = f"{self.valid.dtype} {self.valid.shape}"
+            raise UsageError(f"valid must be an array of bool of shape {sensors_markers}, got {got}")
         if self.positions.shape != (sensors_markers[1], 2):
             raise UsageError(f"positions must have shape ({sensors_markers[1]}, 2), got {self.positions.shape}")
         if self.unit not in MIN_DIVISORS:
@@ -111,7 +114,8 @@ def resampling_weights(positions: ArrayLike, grid: Grid) -> NDArray[np.float64]:
     """Weights of the interpolation of marker values to `grid`: linear between markers, nearest outside their hull.
 
     `positions` [mm], shape (markers, 2). Returns shape (rows * cols, markers); every row sums to 1. The row of a
-    grid point that coincides with a marker selects that marker exactly, so equal grids are unchanged.
+    grid point that coincides with a marker selects that marker exactly, so equal grids are unchanged. Raises UsageError
+    when the markers of another grid lie on one line.
     """
     points = np.asarray(positions, dtype=float)
     targets = grid.positions()
@@ -121,17 +125,25 @@ def resampling_weights(positions: ArrayLike, grid: Grid) -> NDArray[np.float64]:
     exact = distance.min(axis=1) < 1e-6 * grid.pitch
     inside = np.full(len(targets), -1)
     if not exact.all() and len(points) >= 3:
-        from scipy.spatial import Delaunay  # deferred: only different grids need it
+        from scipy.spatial import Delaunay, QhullError  # deferred: only different grids need it
 
-        mesh = Delaunay(points)
-        inside = mesh.find_simplex(targets)
+        try:
+            mesh = Delaunay(points)
+        except QhullError:
+            raise UsageError(
+                f"the {len(points)} markers lie on one line: their values cannot be interpolated to a grid of "
+                f"{grid.rows} × {grid.cols} markers"
+            ) from None
+        # Points on the edge of the hull may lie outside by the rounding of positions in single precision.
+        inside = mesh.find_simplex(targets, tol=_ON_EDGE)
     for i, (target, simplex) in enumerate(zip(targets, inside, strict=True)):
         if exact[i] or simplex < 0:
             weights[i, nearest[i]] = 1.0
         else:
             transform = mesh.transform[simplex]
             two = transform[:2] @ (target - transform[2])
-            weights[i, mesh.simplices[simplex]] = [*two, 1 - two.sum()]
+            three = np.clip([*two, 1 - two.sum()], 0.0, None)
+            weights[i, mesh.simplices[simplex]] = three / three.sum()
     return weights
 
 
@@ -154,10 +166,15 @@ def interpolation_weights(grid: Grid, positions: ArrayLike) -> NDArray[np.float6
 def fill_invalid(frame: TactileFrame) -> NDArray[np.float64]:
     """Shear of a frame, with invalid markers replaced by the inverse-distance mean of the 6 nearest valid markers.
 
-    Returns shape (sensors, markers, 2). Raises UsageError when a sensor has fewer than 6 valid markers.
+    Returns shape (sensors, markers, 2). Raises UsageError when a sensor has fewer than 6 valid markers, or a valid one
+    that is not finite.
     """
     shear = frame.shear.astype(float)
     for sensor, valid in enumerate(frame.valid):
+        if not np.isfinite(shear[sensor, valid]).all():
+            raise UsageError(
+                f"sensor {sensor} has a valid marker whose shear is not finite; set its flag valid to False"
+            )
         if valid.all():
             continue
         if valid.sum() < 6:
@@ -180,7 +197,8 @@ def flow_map(
 ) -> FlowMap:
     """The normalized flow map of `frames` against `reference`, on `grid`.
 
-    Raises UsageError when frames differ in unit, sensors or markers, or a sensor has fewer than 6 valid markers.
+    Raises UsageError when frames differ in unit, sensors or markers, a sensor has fewer than 6 valid markers, or a
+    valid marker is not finite.
     """
     if not frames:
         raise UsageError("a flow map needs at least one frame")

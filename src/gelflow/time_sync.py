@@ -9,6 +9,8 @@ after a camera frame.
 
 import math
 import mmap
+import os
+import struct
 import time
 from array import array
 
@@ -18,17 +20,26 @@ _SLOTS = 7
 SIMULATED_CELL, CONTROLLER, LEFT_CAMERA, RIGHT_CAMERA, GRIPPER, ARM_DRIVER, RUNNER = range(_SLOTS)
 MAX_LEAD = 0.02  # lead of robot time over the last finished step, at most [s]
 MIN_WAIT = 2e-4  # shortest sleep while robot time stands still [s, wall]
-_WORDS = 1 + 2 * _SLOTS  # delay [s], then for each slot: wall time of its last grant [s], its limit [s, robot time]
+# Delay [s], then for each slot: wall time of its last grant [s] and its limit [s, robot time]; then the mark.
+_WORDS = 2 + 2 * _SLOTS
+_MARK = struct.unpack("d", b"gelsync1")[0]  # by which such a file is recognized
 _SLOT_TIMEOUT = 15.0  # a slot that grants nothing for longer is taken for dead and ignored [s, wall]
 
 
 class TimeSync:
-    """The shared numbers, mapped from the file at `path`. Raises UsageError when there is no such file."""
+    """The shared numbers, mapped from the file at `path`.
+
+    Raises UsageError when there is no such file, or it is none of a mock robot.
+    """
 
     def __init__(self, path: str) -> None:
         try:
             with open(path, "r+b") as file:
+                if os.fstat(file.fileno()).st_size != 8 * _WORDS:
+                    raise ValueError("not a time-sync file")
                 self._words = memoryview(mmap.mmap(file.fileno(), 8 * _WORDS)).cast("d")
+            if self._words[-1] != _MARK:
+                raise ValueError("not a time-sync file")
         except (OSError, ValueError):
             raise UsageError(f"there is no mock robot behind {path}: has it ended? start it again") from None
         self._newest = -math.inf  # robot time read here so far [s]
@@ -39,6 +50,7 @@ class TimeSync:
         words = array("d", [0.0] * _WORDS)
         for slot in range(_SLOTS):
             words[2 + 2 * slot] = math.inf
+        words[-1] = _MARK
         with open(path, "xb") as file:
             words.tofile(file)
 
@@ -77,7 +89,7 @@ class TimeSync:
         while (again := self._words.tolist()) != words:
             words, wall = again, time.monotonic()
         now = wall * factor - words[0]
-        for granted, limit in zip(words[1::2], words[2::2], strict=True):
+        for granted, limit in zip(words[1:-1:2], words[2:-1:2], strict=True):
             if now > limit:
                 now = min(now, limit + max(0.0, wall - granted - _SLOT_TIMEOUT) * factor)
         # A process that is interrupted after it has read robot time grants a limit that is already past.

@@ -181,6 +181,15 @@ def test_a_missing_time_sync_file_is_an_error(tmp_path: Path) -> None:
         ScaledClock(1.0, str(tmp_path / "gone"))
 
 
+@pytest.mark.parametrize("content", [b"the only copy of something\n" * 5, bytes(8 * time_sync._WORDS)])
+def test_a_file_that_is_none_of_a_mock_robot_is_not_changed(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "precious.txt"
+    path.write_bytes(content)
+    with pytest.raises(UsageError, match="there is no mock robot behind"):
+        ScaledClock(1.0, str(path))
+    assert path.read_bytes() == content
+
+
 @pytest.mark.skipif(not hasattr(os, "SCHED_FIFO"), reason="this system has no real-time priority")
 def test_raised_priority_is_that_of_the_calling_thread_alone() -> None:
     policies: list[int] = []

@@ -297,6 +297,8 @@ def test_misuse_of_the_recorder_raises_usage_errors(tmp_path: Path) -> None:
             recorder.decision({"insertion": 0} | {k: v for k, v in a_decision().to_json().items() if k != "attempt"})
         with pytest.raises(UsageError, match="cannot contain a set"):
             recorder.event("bad", {"values": {1, 2}})
+        with pytest.raises(UsageError, match="cannot contain a set"):
+            recorder.metadata({"lab": {1, 2}})
         recorder.metadata({})
         with pytest.raises(UsageError, match="once"):
             recorder.metadata({})

@@ -1,5 +1,6 @@
 """Records by time agree with those of a reader that reads everything."""
 
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -114,6 +115,24 @@ def test_a_damaged_chunk_is_counted_and_the_rest_is_found(path: Path, tmp_path: 
         assert found is not None and found.time < inside
         assert index.damaged == 1
         assert index.latest("/gripper/state", index.end) is not None
+
+
+def test_threads_read_the_same_session(path: Path) -> None:
+    with SessionReader(path) as session:
+        index, count, ended = TimeIndex(session), len(list(session.records())), threading.Event()
+
+        def jump() -> None:
+            while not ended.is_set():
+                session.chunk(session.summary.chunk_indexes[3])  # type: ignore[union-attr]
+
+        jumping = threading.Thread(target=jump)
+        jumping.start()
+        try:
+            counts = {len(list(session.records())) for _ in range(20)}
+        finally:
+            ended.set()
+            jumping.join()
+        assert counts == {count} and index.damaged == 0
 
 
 def test_a_session_without_records_is_refused(tmp_path: Path) -> None:

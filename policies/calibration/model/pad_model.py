@@ -44,16 +44,16 @@ class PadModel:
             self._read = to_grid @ to_printed
             self._exchange = to_grid @ _exchange([on_print] * len(grids)) @ to_printed
 
-    def crosstalk_on_grid(self, crosstalk: Array) -> Array:
+    def crosstalk_on_grid(self, crosstalk: Array, flow: Array, used: NDArray[np.bool_]) -> Array:
         """The crosstalk between markers of the policy's grid that is equivalent to `crosstalk` between printed markers.
 
-        Equivalent means the same change of a field of constant curvature. The interpolations between both grids are
-        included. Changes are medians, because neighbours are missing at the borders of the grid.
+        Equivalent means, as nearly as possible, the same change of the flow maps `flow` (n, markers, 2) at the `used`
+        markers (markers,), by least squares; between 0 and 1. The interpolations between both grids are included.
         """
-        field = np.concatenate([(grid.positions() ** 2).sum(1) for grid in self._grids])[:, None]
-        on_grid = np.median(_product(self._exchange_on_grid, field))
-        least, full = (np.median(self._mixed(field, np.asarray(c)) - field) / on_grid for c in (0.0, 1.0))
-        return np.asarray(least + (full - least) * np.asarray(crosstalk))
+        on_grid = _product(self._exchange_on_grid, flow)[:, used]
+        changes = [(self._mixed(flow, np.asarray(c)) - flow)[:, used] for c in (0.0, 1.0)]
+        least, full = (float(np.vdot(on_grid, change) / np.vdot(on_grid, on_grid)) for change in changes)
+        return np.asarray(np.clip(least + (full - least) * np.asarray(crosstalk), 0.0, 1.0))
 
     def _mixed(self, shear: Array, crosstalk: Array) -> Array:
         return np.asarray(_product(self._read, shear) + crosstalk * _product(self._exchange, shear))

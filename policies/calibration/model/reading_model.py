@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.observation import Unit
+from gelflow.policies.calibration.model.fidelity import EXACT, Fidelity
 from gelflow.policies.calibration.model.pad_model import PadModel
 from gelflow.policies.calibration.model.parameters import Parameter, parameters
 from gelflow.policies.calibration.model.shear_model import QUANTITIES, Descents, ShearModel
@@ -24,12 +25,12 @@ class ReadingModel:
     recordings: give task, grasp, unit, printed markers, settling time and the spread of start heights; they may have
         no attempt
     threads: of the simulator
-    rough: see `ShearModel`
+    fidelity: see `ShearModel`
     """
 
-    def __init__(self, recordings: Recordings, *, threads: int | None = None, rough: bool = False) -> None:
+    def __init__(self, recordings: Recordings, *, threads: int | None = None, fidelity: Fidelity = EXACT) -> None:
         self.fitted: tuple[Parameter, ...] = parameters(recordings)
-        self.forces = ShearModel(recordings.task, settle=recordings.settle, threads=threads, rough=rough)
+        self.forces = ShearModel(recordings.task, settle=recordings.settle, threads=threads, fidelity=fidelity)
         scene = self.forces.scene
         self.pads = PadModel(scene.grids, [pad.positions for pad in scene.pads], printed=recordings.printed)
         self.height_spread = recordings.height_spread

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import SimulationError, UsageError
 from gelflow.geometry import apply_planar, rotated, rotation_matrices, turned_about_z
+from gelflow.policies.calibration.model.fidelity import EXACT, Fidelity
 from gelflow.sim import _core
 from gelflow.sim.simulator import STATUS_MESSAGES, Simulator
 from gelflow.sim.tasks.gripper.pads import NOMINAL_PAD_VALUES
@@ -32,8 +33,8 @@ CONTACT_QUANTITIES = ("pad_kn", "pad_mu", "pad_ks", "marker_kn", "marker_mu", "m
 QUANTITIES = (*CONTACT_QUANTITIES, "arm_stiffness", "grasp_force", "grasp_height")
 _WITHOUT_GRASP = ("hole_kn", "hole_mu")  # have no effect on the grasp at rest
 POSE = ("x", "y", "yaw", "z")  # directions of the pose of a descent, after `QUANTITIES`
-_ITERATION_LIMIT = 80  # of Newton's method in a step of a rough simulation
 _BATCH = 64  # descents that are simulated at once
+_PAST_RIM = 0.5e-3  # depth below the rim up to which all steps of a descent are simulated [m]
 _KEPT = 8  # numbers of descents for which a simulator is kept
 _FINGERS = (("finger_left", "pad_left"), ("finger_right", "pad_right"))
 
@@ -69,16 +70,20 @@ class ShearModel:
     task: task of the descents
     settle: time at the end of a descent until the reading [s]; 0 for the training environment, which reads in motion
     threads: of the simulator
-    rough: with the preset `fast`; a descent fails if a step needs many iterations, see `lift_iteration_limit`
+    fidelity: of the simulation; an iteration limit can be lifted, see `lift_iteration_limit`
     """
 
     def __init__(
-        self, task: InsertionTask, *, settle: float = 0.0, threads: int | None = None, rough: bool = False
+        self, task: InsertionTask, *, settle: float = 0.0, threads: int | None = None, fidelity: Fidelity = EXACT
     ) -> None:
         self.task = task
-        self.scene = self._without_limit = insertion_scene(task, preset="fast" if rough else None)
-        if rough:
-            self.scene = dataclasses.replace(self.scene, max_step_iterations=_ITERATION_LIMIT)
+        self.scene = insertion_scene(task, preset=fidelity.preset)
+        if fidelity.tolerance is not None:
+            self.scene = dataclasses.replace(self.scene, tolerance=fidelity.tolerance)
+        self._without_limit = self.scene
+        if fidelity.iteration_limit is not None:
+            self.scene = dataclasses.replace(self.scene, max_step_iterations=fidelity.iteration_limit)
+        self._fidelity = fidelity
         self._threads = threads
         step = self.scene.step
         self._settle_steps, self._hold_steps = round(SETTLE_TIME / step), round(settle / step)
@@ -127,12 +132,10 @@ class ShearModel:
         sim.params[:] = grasp.params
         sim.reset()
         sim.q[:], sim.anchors[:], sim.anchored[:] = q, grasp.anchors, anchored
-        steps, z = self._steps(descents.depth), self._arm_u[2]
-        start, most = u[:, z].copy(), int(steps.max())
-        for step in range(1, most + 1):
-            # Descents end at the same time; before a descent begins, the gripper is at rest.
-            taken = np.maximum(step - (most - steps), 0)
-            u[:, z] = start - descents.depth * taken / steps
+        z = self._arm_u[2]
+        start = u[:, z].copy()
+        for depth in self._depths(descents.depth):
+            u[:, z] = start - depth
             sim.step(u)
         sim.step(u, self._hold_steps)
         change = sim.tactile()[:, :, :2] - grasp.shear
@@ -147,8 +150,19 @@ class ShearModel:
         grasp, anchored, held = self._grasp(sim, dict(zip(QUANTITIES, different.T, strict=True)))
         return _Grasp(*(array[of_row] for array in vars(grasp).values())), anchored[of_row], held[of_row]
 
-    def _steps(self, depth: Array) -> NDArray[np.int64]:
-        return np.maximum(1, np.round(depth / self.step_depth)).astype(np.int64)
+    def _depths(self, depth: Array) -> Array:
+        """Depths below the start after each step of descents (n,), shape (steps, n).
+
+        Descents end at the same time; before a descent begins, the gripper is at rest.
+        """
+        counts = np.maximum(1, np.round(depth / self.step_depth)).astype(np.int64)
+        to_rim = self.task.start_height - self.task.rim_height
+        near_rim = int((to_rim + _PAST_RIM) / self.step_depth)
+        taken = [self._fidelity.simulated_steps(count, near_rim) for count in counts]
+        result = np.zeros((max(map(len, taken)), len(depth)))
+        for i, steps in enumerate(taken):
+            result[len(result) - len(steps) :, i] = depth[i] * steps / counts[i]
+        return result
 
     def _params(self, sim: Simulator, values: Mapping[str, Array]) -> Array:
         """Parameters of the simulator, (n, parameters)."""
@@ -264,10 +278,9 @@ class ShearModel:
         """Value of one descent, and its derivatives along the directions that `settled` names."""
         one = _Grasp(*(np.asarray(values)[None] for values in vars(grasp).values()))
         q, controls = self._start(one, descent)
-        count, depth, z = int(self._steps(descent.depth)[0]), float(descent.depth[0]), self._arm_u[2]
-        u = np.repeat(controls, count + self._hold_steps, axis=0)
-        u[:count, z] -= depth * np.arange(1, count + 1) / count
-        u[count:, z] -= depth
+        depths, z = self._depths(descent.depth)[:, 0], self._arm_u[2]
+        u = np.repeat(controls, len(depths) + self._hold_steps, axis=0)
+        u[:, z] -= np.append(depths, np.repeat(descent.depth, self._hold_steps))
         start = (grasp.params, q[0], grasp.anchors, u, anchored)
         tangents = [self._tangent_at_start(sim, name, tangent, q[0], descent) for name, tangent in settled.items()]
         end = self._dual(sim, start, tangents)

@@ -71,7 +71,8 @@ def plan_motions(
     scenarios: number of scenarios over which the information is averaged
     progress: gets the number of finished scenarios
 
-    Raises UsageError when the workspace leaves no candidate, SimulationError when no scenario can be simulated.
+    Raises UsageError when the workspace leaves no candidate, or none with contact, and SimulationError when no scenario
+    can be simulated.
     """
     readings = ReadingModel(recordings)
     task, rng = recordings.task, np.random.default_rng((seed, 0x9A2))
@@ -92,6 +93,11 @@ def plan_motions(
     if not found:
         raise SimulationError("no plan: the attempts cannot be simulated with the parameters of any scenario")
     before: Array = np.eye(len(readings.fitted)) if joint is None else np.asarray(np.linalg.inv(joint[1]))
+    if not any(each.any() for each in found):
+        raise UsageError(
+            "no motion to plan: none within the workspace is expected to touch the rim; allow a larger workspace, or "
+            "record insertions first"
+        )
     chosen, gains, after = _greedy(np.stack(found), before, pose_prior(task), count)
     motions = tuple(PlannedMotion(x, y, yaw, task.descent, stop_shear_mm) for x, y, yaw in poses[chosen].tolist())
     names = [p.name for p in readings.fitted]

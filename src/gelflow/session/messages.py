@@ -2,6 +2,7 @@
 
 import heapq
 import itertools
+import os
 import struct
 import zlib
 from collections.abc import Collection, Iterator
@@ -96,8 +97,8 @@ def chunk_topics(chunk: ChunkIndex, summary: Summary) -> list[str]:
 
 
 def chunk_messages(stream: BinaryIO, index: ChunkIndex, summary: Summary) -> list[tuple[Channel, Message]]:
-    """All messages of a chunk. Raises one of `READ_ERRORS` when it is damaged."""
-    stream.seek(index.chunk_start_offset + _RECORD_HEAD)
-    data = stream.read(index.chunk_length - _RECORD_HEAD)
+    """All messages of a chunk, for any thread. Raises one of `READ_ERRORS` when it is damaged."""
+    # Not seek and read: another thread would move the position between the two.
+    data = os.pread(stream.fileno(), index.chunk_length - _RECORD_HEAD, index.chunk_start_offset + _RECORD_HEAD)
     records = breakup_chunk(Chunk.read(ReadDataStream(BytesIO(data))), validate_crc=True)
     return [(summary.channels[record.channel_id], record) for record in records if isinstance(record, Message)]

@@ -4,7 +4,6 @@ import dataclasses
 import fcntl
 import json
 import shlex
-import threading
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -53,7 +52,6 @@ class SessionReader:
         self.epoch = 0.0  # date of the robot time 0 as seconds since 1970; 0 in files that contain no dates
         self._epoch = 0  # the same [ns]
         self._stream: BinaryIO | None = None
-        self._reading = threading.Lock()  # of the stream's position
         self._reader: SeekingReader | None = None
 
     def open(self) -> "SessionReader":
@@ -160,8 +158,7 @@ class SessionReader:
         summary = self.summary
         assert self._stream is not None and summary is not None
         try:
-            with self._reading:
-                found = chunk_messages(self._stream, index, summary)
+            found = chunk_messages(self._stream, index, summary)
             return [(channel.topic, message) for channel, message in found]
         except READ_ERRORS as error:
             raise self._damaged(error) from error

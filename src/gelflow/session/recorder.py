@@ -106,8 +106,8 @@ class SessionRecorder:
         """Record the description of the session (`describe_session`). Raises UsageError on a second call."""
         if self._described:
             raise UsageError("the session already has a description; call metadata once")
-        self._described = True
         self._json("/session", {"format": FORMAT, "epoch": self._epoch / 1e9, **to_plain(description)})
+        self._described = True
 
     def image(self, sensor: int, image: CameraImage) -> None:
         """Record a camera image as received. `sensor` 0 is the left finger."""

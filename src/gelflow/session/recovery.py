@@ -81,7 +81,7 @@ def _copied(stream: BinaryIO, source: Path, target: Path) -> "_Copy":
                 copy.take(opcode, data)
             copy.finish(source)
         if copy.messages == 0:
-            raise PeerError(f"{source} contains no complete message; there is nothing to recover")
+            raise PeerError(f"{source} contains no complete message that can be found; there is nothing to recover")
         if not copy.described:
             raise UsageError(
                 f"{source} contains neither the metadata nor the description of a gelflow session; name a session "

@@ -31,7 +31,9 @@ def flow_image(flow: NDArray[np.float32], nanoseconds: int) -> RawImage:
 def event_log(name: str, values: Mapping[str, Any], nanoseconds: int) -> Log:
     """An event in words, as a line of a log."""
     level = Log.ERROR if name in ERRORS else Log.WARNING if name in WARNINGS else Log.INFO
-    message = Log(level=level, name=name, message=event_text(name, values))
+    # Paths may have bytes that are not UTF-8, which a message cannot contain.
+    text = event_text(name, values).encode("utf-8", "backslashreplace").decode()
+    message = Log(level=level, name=name, message=text)
     message.timestamp.FromNanoseconds(nanoseconds)
     return message
 

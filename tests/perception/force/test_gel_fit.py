@@ -145,6 +145,13 @@ def test_contacts_whose_start_was_not_seen_do_not_change_the_lag() -> None:
     assert fit.gel.youngs_modulus == pytest.approx(1.4 * GUESS.youngs_modulus, rel=1e-3)
 
 
+def test_a_table_with_times_and_images_is_refused(layer: PressedLayer, tmp_path: Path) -> None:
+    estimates, scale = record(layer, tmp_path)
+    scale.write_text("image,stamp,normal_n\n" + "\n".join(f"{k}.jpg,{0.1 * k},2" for k in range(6)))
+    with pytest.raises(UsageError, match="has the columns stamp and image; give one"):
+        read_samples(estimates, scale)
+
+
 def test_times_in_milliseconds_are_refused(layer: PressedLayer, tmp_path: Path) -> None:
     estimates, scale = record(layer, tmp_path)
     head, *rows = (line.split(",") for line in scale.read_text().splitlines())

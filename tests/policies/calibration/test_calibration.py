@@ -21,6 +21,7 @@ from gelflow.policies.calibration.calibration import Calibration
 from gelflow.policies.calibration.experiment.transfer import World, measure_world, worlds
 from gelflow.policies.calibration.experiment.worlds import RecordedWorld, record_world
 from gelflow.policies.calibration.fit import FitSettings, fit
+from gelflow.policies.calibration.model.fidelity import COARSE, ROUGH, Fidelity
 from gelflow.policies.calibration.model.shear_model import POSE, QUANTITIES, Descents, ShearModel
 from gelflow.policies.calibration.pose_search import find_poses
 from gelflow.policies.calibration.problem import Problem
@@ -52,14 +53,40 @@ def test_the_model_gives_the_forces_of_the_training_environment() -> None:
     assert np.abs(shear.reshape(2, 2, -1, 2).transpose(0, 1, 3, 2) - expected).max() < 1e-5 * np.abs(expected).max()
 
 
-def test_a_rough_descent_fails_where_a_step_needs_many_iterations(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("depth", [0.9e-3, 4.1e-3])
+@pytest.mark.parametrize(("fidelity", "error"), [(COARSE, 0.02), (ROUGH, 0.05)])
+def test_a_coarse_or_rough_descent_has_almost_the_forces_of_the_exact_one(
+    depth: float, fidelity: Fidelity, error: float
+) -> None:
+    # A soft arm lets the gripper go on to its full depth.
+    values = {name: np.full(2, value) for name, value in (VALUES | {"arm_stiffness": 2e3}).items()}
+    descents = Descents(np.array([[3e-3, -1e-3, 0.05], [1e-3, 4e-3, -0.1]]), np.zeros(2), np.full(2, depth))
+    exact, _ = ShearModel(INSERTION, threads=1).shear(values, descents)
+    other, ok = ShearModel(INSERTION, threads=1, fidelity=fidelity).shear(values, descents)
+    assert ok.all() and np.abs(other - exact).max() < error * np.abs(exact).max()
+
+
+def test_a_descent_with_long_step_has_short_ones_at_the_rim_and_at_its_end() -> None:
+    exact = ShearModel(INSERTION, threads=1)._depths(np.array([4.1e-3, 0.6e-3]))
+    long = ShearModel(INSERTION, threads=1, fidelity=COARSE)._depths(np.array([4.1e-3, 0.6e-3]))
+    assert len(long) < 0.7 * len(exact)
+    step = exact[0, 0]
+    np.testing.assert_allclose(np.diff(exact[:, 0]), step)
+    steps = np.diff(long[:, 0], prepend=0.0)
+    np.testing.assert_allclose(steps[long[:, 0] < 1e-3], step)
+    np.testing.assert_allclose(steps[-8:], step)
+    assert steps.max() == pytest.approx(COARSE.long_step * step)
+    assert np.isin(long.round(9), exact.round(9)).all() and long[-1, 0] == pytest.approx(4.1e-3)
+    # A short descent, which waits for the longer one, has all of its steps.
+    shallow = exact[exact[:, 1] > 0, 1]
+    np.testing.assert_array_equal(long[long[:, 1] > 0, 1], shallow)
+
+
+def test_a_rough_descent_fails_where_a_step_needs_many_iterations() -> None:
     values = {name: np.full(2, value) for name, value in VALUES.items()}
     descents = Descents(np.array([[3e-3, -1e-3, 0.05], [1e-3, 4e-3, -0.1]]), np.zeros(2), np.full(2, 0.9e-3))
-    exact, _ = ShearModel(INSERTION, threads=1).shear(values, descents)
-    rough, ok = ShearModel(INSERTION, threads=1, rough=True).shear(values, descents)
-    assert ok.all() and np.abs(rough - exact).max() < 0.05 * np.abs(exact).max()
-    monkeypatch.setattr("gelflow.policies.calibration.model.shear_model._ITERATION_LIMIT", 1)
-    model = ShearModel(INSERTION, threads=1, rough=True)
+    rough, _ = ShearModel(INSERTION, threads=1, fidelity=ROUGH).shear(values, descents)
+    model = ShearModel(INSERTION, threads=1, fidelity=dataclasses.replace(ROUGH, iteration_limit=1))
     assert not model.shear(values, descents)[1].any()
     assert model.lift_iteration_limit() and not model.lift_iteration_limit()
     np.testing.assert_array_equal(model.shear(values, descents)[0], rough)

@@ -1,11 +1,14 @@
 """The global search: its update against the Kalman filter's, and the unknowns that it finds in a recorded world."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from gelflow.errors import SimulationError
 from gelflow.policies.calibration import ensemble
 from gelflow.policies.calibration.experiment.worlds import RecordedWorld
+from gelflow.policies.calibration.model.fidelity import ROUGH
 from gelflow.policies.calibration.pose_search import better_poses
 from gelflow.policies.calibration.poses import costs_of_insertions, draw_poses
 from gelflow.policies.calibration.problem import Problem
@@ -35,7 +38,7 @@ def test_two_updates_with_half_of_the_recordings_equal_one_with_all() -> None:
 
 
 def test_the_search_finds_unknowns_that_no_random_guess_comes_near(world: RecordedWorld) -> None:
-    problem = Problem(world.recordings.of(np.arange(2)), rough=True)
+    problem = Problem(world.recordings.of(np.arange(2)), fidelity=ROUGH)
     problem.allow_for(model_error=0.04)
     point, poses = ensemble.search_globally(problem, 96, np.random.default_rng(0))
     residuals, ok = ensemble._residuals(problem, point[None], poses[None])
@@ -63,20 +66,17 @@ def test_wrong_poses_are_replaced_and_right_ones_kept(world: RecordedWorld) -> N
 
 
 def test_guesses_that_cannot_be_simulated_end_the_search(world: RecordedWorld, monkeypatch: pytest.MonkeyPatch) -> None:
-    problem = Problem(world.recordings.of(np.arange(1)), rough=True)
+    problem = Problem(world.recordings.of(np.arange(1)), fidelity=ROUGH)
     predicted = problem.predicted
     monkeypatch.setattr(problem, "predicted", lambda *given: (predicted(*given)[0], np.zeros(len(given[1]), np.bool_)))
     with pytest.raises(SimulationError, match="most guesses"):
         ensemble.search_globally(problem, 8, np.random.default_rng(0))
 
 
-def test_an_iteration_limit_that_most_guesses_exceed_is_lifted(
-    world: RecordedWorld, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("gelflow.policies.calibration.model.shear_model._ITERATION_LIMIT", 1)
-    found = []
+def test_an_iteration_limit_that_most_guesses_exceed_is_lifted(world: RecordedWorld) -> None:
+    limited, found = dataclasses.replace(ROUGH, iteration_limit=1), []
     for lifted in (True, False):
-        problem = Problem(world.recordings.of(np.arange(1)), threads=1, rough=True)
+        problem = Problem(world.recordings.of(np.arange(1)), threads=1, fidelity=limited)
         if lifted:
             problem.readings.forces.lift_iteration_limit()
         poses = world.misalignment[:1]

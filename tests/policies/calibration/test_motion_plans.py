@@ -101,6 +101,12 @@ def test_a_plan_has_its_most_informative_motions_first_and_keeps_to_the_workspac
         plan_motions(LAB, workspace=(1e-3, 1e-3, 0.0))
 
 
+def test_a_plan_without_contact_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gelflow.policies.calibration.planning.motions._CONTACT_SHEAR_MM", 1e6)
+    with pytest.raises(UsageError, match="none within the workspace is expected to touch the rim"):
+        plan_motions(LAB, count=2, workspace=NEAR, scenarios=1)
+
+
 @pytest.mark.slow
 def test_a_plan_depends_on_what_is_known_already() -> None:
     count = len(ReadingModel(LAB).fitted)

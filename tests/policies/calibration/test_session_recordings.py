@@ -15,6 +15,7 @@ from gelflow.cli.main import main
 from gelflow.cli.session_replay import visible_markers
 from gelflow.clock import ScaledClock
 from gelflow.errors import UsageError
+from gelflow.observation import Grid
 from gelflow.perception.frames import CameraMount
 from gelflow.policies.calibration.calibrated_scene import write_scene
 from gelflow.policies.calibration.comparison import SimulatedSession
@@ -179,6 +180,39 @@ def test_markers_that_the_camera_does_not_show_are_not_compared(tmp_path: Path, 
         assert hidden.sum() == 2 and (hidden[:2].all() or hidden[-2:].all())
 
 
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"planar_pose": [0.0, 0.0]}, "insertion 0, attempt 0: planar_pose must be three finite numbers"),
+        ({"planar_pose": [0.0, float("nan"), 0.0]}, "insertion 0, attempt 0: planar_pose must be three finite numbers"),
+        ({"planar_pose": ["a", "b", "c"]}, "a value of another kind"),
+        ({"planar_pose": {"x": 0.0}}, "a value of another kind"),
+        ({"insertion": "a"}, "a value of another kind"),
+        ({"attempt": None}, "a value of another kind"),
+        ({"depth": "deep"}, "a value of another kind"),
+    ],
+)
+@pytest.mark.parametrize("outcome", ["inserted", "not inserted"])
+def test_values_of_another_kind_are_refused(
+    tmp_path: Path, changes: dict[str, Any], message: str, outcome: str
+) -> None:
+    path = tmp_path / "own.mcap"
+    attempt = {"insertion": 0, "attempt": 0, "planar_pose": [0.0] * 3, "depth": 1e-3, "contact": True}
+    with SessionRecorder(path, ScaledClock()) as recorder:
+        recorder.metadata(describe_session(task=INSERTION, trackers=[{}, {}], mounts=[{}, {}], lab=LAB))
+        recorder.attempt_end({**attempt, "outcome": outcome, **changes})
+    with pytest.raises(UsageError, match=message):
+        read_recordings([path])
+
+
+def test_flow_maps_of_another_grid_are_refused(tmp_path: Path, world: RecordedWorld) -> None:
+    path = write_session(tmp_path / "a.mcap", world, grid=dataclasses.asdict(Grid(9, 7, 2.0)))
+    with pytest.raises(
+        UsageError, match=r"has a flow map of shape \(2, 13, 10, 2\), the task of the session \(2, 9, 7"
+    ):
+        read_recordings([path])
+
+
 def test_values_that_are_not_finite_are_refused(tmp_path: Path, world: RecordedWorld) -> None:
     recordings = dataclasses.replace(world.recordings, depth=world.recordings.depth * np.nan)
     session = write_session(tmp_path / "nan.mcap", dataclasses.replace(world, recordings=recordings))
@@ -237,6 +271,15 @@ def test_no_file_of_the_folder_is_overwritten(tmp_path: Path, capsys: pytest.Cap
     assert main(["calibrate", "missing.mcap", "--out", str(tmp_path)]) == 2
     assert f"{name} exists; name a new folder with --out" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == [name] and (tmp_path / name).read_text() == "mine"
+
+
+def test_the_report_is_neither_a_plan_nor_a_link(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    assert main(["calibrate", "missing.mcap", "--out", str(out), "--plan", str(out / "report.json")]) == 2
+    assert "is a file of the report; give the plan another name" in capsys.readouterr().err
+    (tmp_path / "scene.toml").symlink_to("nowhere")
+    assert main(["calibrate", "missing.mcap", "--out", str(tmp_path)]) == 2
+    assert "scene.toml exists; name a new folder with --out" in capsys.readouterr().err
 
 
 def test_a_folder_that_cannot_be_written_to_is_refused_before_the_fit(

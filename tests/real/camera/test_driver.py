@@ -275,6 +275,9 @@ def test_invalid_addresses_are_refused(url: str) -> None:
 def test_invalid_sources_and_settings_are_refused() -> None:
     with pytest.raises(UsageError, match="uvc:INDEX"):
         open_camera("left.jpg", "left", CLOCK)
+    for number in ("²", "99999999999999999999"):
+        with pytest.raises(UsageError, match="is not that of a camera"):
+            open_camera(f"uvc:{number}", "left", CLOCK)
     with pytest.raises(UsageError, match="timeout"):
         MjpegCamera("http://host/", "left", CLOCK, timeout=0)
     with pytest.raises(UsageError, match="rate"):

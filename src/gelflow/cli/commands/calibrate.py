@@ -98,8 +98,10 @@ def run(args: argparse.Namespace) -> int:
         return SUCCESS
     files = [args.out / "report.json", args.out / "report.html", args.out / SCENE, args.out / MODEL]
     for file in files:
-        if file.exists():
+        if os.path.lexists(file):
             raise UsageError(f"{file} exists; name a new folder with --out")
+        if args.plan is not None and args.plan.resolve() == file.resolve():
+            raise UsageError(f"--plan {args.plan} is a file of the report; give the plan another name")
     recordings = read_attempts(args.sessions, args.part)
     if args.plan is not None:
         candidates(recordings.task, _workspace(lab))
@@ -165,7 +167,7 @@ def _check(args: argparse.Namespace) -> None:
         raise UsageError("--lab gives the limits of --plan; name the plan file, or leave --lab out")
     if not args.sessions and args.quick:
         raise UsageError("--quick is for the fit of a SESSION; leave it out")
-    if args.plan is not None and args.plan.exists():
+    if args.plan is not None and os.path.lexists(args.plan):
         raise UsageError(f"{args.plan} exists; name a new file with --plan")
 
 
