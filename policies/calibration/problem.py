@@ -49,9 +49,7 @@ class Problem:
                 "markers are too noisy"
             )
         self.readings = ReadingModel(recordings, threads=threads, fidelity=fidelity)
-        self._coarse_readings = self.readings
-        if fidelity == EXACT:
-            self._coarse_readings = ReadingModel(recordings, threads=threads, fidelity=COARSE)
+        self._threads = threads
         self.fitted = self.readings.fitted
         self._scale = self.readings.scale
         self._set_recordings(recordings)
@@ -59,9 +57,9 @@ class Problem:
 
     @property
     def coarse(self) -> "Problem":
-        """The same problem in the coarse simulation."""
+        """A copy in the coarse simulation."""
         result = copy.copy(self)
-        result.readings = self._coarse_readings
+        result.readings = ReadingModel(self.recordings, threads=self._threads, fidelity=COARSE)
         return result
 
     def of(self, insertion: int) -> "Problem":
