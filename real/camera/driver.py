@@ -38,9 +38,10 @@ def open_camera(
         ).open()
     if source.startswith("uvc:"):
         device = source.removeprefix("uvc:")
-        if device.isdigit() and not re.fullmatch("[0-9]{1,9}", device):
+        number = re.fullmatch("[0-9]{1,9}", device)
+        if device.isdigit() and not number:
             raise UsageError(f"camera {name}: the number in {source!r} is not that of a camera")
-        chosen = int(device) if device.isdigit() else device
+        chosen = int(device) if number else device
         return UvcCamera(
             chosen, name, clock, timeout=timeout, latency=latency, frozen_after=frozen_after, on_image=on_image
         ).open()
