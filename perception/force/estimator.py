@@ -25,9 +25,8 @@ _PRESSED = 0.1  # cells with this share of the largest normal load count as cont
 # Added to the deviations for errors of the layer model and of the contact's assumed shape, relative to the value;
 # measured, see docs/guide/sensing/forces.md.
 _SHEAR_ERROR, _NORMAL_ERROR, _MOMENT_ERROR = 0.015, 0.06, 0.06
-_blas_limit = (
-    threading.Lock()
-)  # held while the number of threads of the linear algebra, one for the process, is limited
+# Held while the number of threads of the linear algebra is limited: it is one number for the whole process.
+_blas_limit = threading.Lock()
 
 
 def check_force_grid(rows: int, cols: int) -> None:
