@@ -33,7 +33,9 @@ class EvaluationResult:
         n, z = self.episodes, 1.96 if comparisons == 1 else NormalDist().inv_cdf(1 - 0.025 / comparisons)
         middle = (self.success + z * z / (2 * n)) / (1 + z * z / n)
         half = z / (1 + z * z / n) * np.sqrt(self.success * (1 - self.success) / n + z * z / (4 * n * n))
-        return max(0.0, middle - half), min(1.0, middle + half)
+        # Rounding must not move a limit off 0 without a success, nor off 1 without a failure.
+        low = max(0.0, middle - half) if self.successes else 0.0
+        return low, min(1.0, middle + half) if self.successes < n else 1.0
 
     def to_json(self) -> dict[str, Any]:
         """As JSON data; the length is stored under the name of its unit."""

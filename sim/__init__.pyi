@@ -14,7 +14,9 @@ from .scene.loader import scene_names as scene_names
 from .scene.scene import Scene as Scene
 from .simulator import STATUS_MESSAGES as STATUS_MESSAGES
 from .simulator import Simulator as Simulator
+from .tasks.cap_rotation import CapRotationTask as CapRotationTask
 from .tasks.differentiable_pushing import DifferentiablePushing as DifferentiablePushing
+from .tasks.grasp import GraspTask as GraspTask
 from .tasks.gripper.flow_map_noise import FlowMapNoise as FlowMapNoise
 from .tasks.gymnasium_envs import TaskEnv as TaskEnv
 from .tasks.gymnasium_envs import TaskVectorEnv as TaskVectorEnv
@@ -47,11 +49,13 @@ from .validation.energy import EnergyGauge as EnergyGauge
 __all__ = [
     "STATUS_MESSAGES",
     "Camera",
+    "CapRotationTask",
     "DifferentiablePushing",
     "Energy",
     "EnergyGauge",
     "Fixed",
     "FlowMapNoise",
+    "GraspTask",
     "InsertionAttempts",
     "InsertionEnv",
     "InsertionVectorEnv",

@@ -261,6 +261,15 @@ def test_failures_are_counted_in_ranges_of_equally_many_episodes() -> None:
     assert worst_ranges(ranges) == ["most failures by mass: 20 of 20 between 800 and 1000 g"]
 
 
+@pytest.mark.parametrize("count", [10, 200, 1000, 4096])
+def test_an_evaluation_without_failures_names_no_quantity(count: int) -> None:
+    table = {"mass": np.linspace(0, 1, count), "friction": np.linspace(1, 0, count)}
+    episodes = Episodes(np.ones(count, bool), np.zeros(count, bool), np.ones(count, int), np.zeros(count), table)
+    ranges = failure_ranges(episodes)
+    assert {entry.confidence_interval()[0] for entry in ranges} == {0.0}
+    assert worst_ranges(ranges) == []
+
+
 @pytest.mark.parametrize(("count", "rate"), [(200, 0.9), (1000, 0.6)])
 def test_failures_that_depend_on_nothing_are_seldom_ascribed_to_a_quantity(count: int, rate: float) -> None:
     rng, named, evaluations = np.random.default_rng(0), 0, 100

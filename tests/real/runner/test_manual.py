@@ -97,7 +97,7 @@ def test_a_stopped_run_is_cleared_by_jog_open_and_home(robot: MockRobot, tmp_pat
 
     # With a part in the grip nothing homes by itself, and a sideways motion raises it first.
     code, _ = operator.run("home", "--yes")
-    assert code == 2 and "a part may be held" in operator.errors and "gelflow robot open" in operator.errors
+    assert code == 2 and "a part may be held" in operator.errors and "gelflow robot open --lab " in operator.errors
     down = 1e3 * (status["arm"]["height"] - 25.3e-3)  # 0.3 mm above the rim
     code, _ = operator.run("jog", "z", f"-{down:.2f}", "--yes")
     assert code == 0, operator.errors

@@ -114,7 +114,7 @@ def test_fault_while_the_operator_is_asked_ends_the_run_at_once(
         _, errors = process.communicate(timeout=60)  # Enter is never pressed
     assert process.returncode == 2
     assert expected in errors.decode() and errors.decode().count("\n") == 1
-    assert f"gelflow robot jog --lab {tmp_path / 'lab.toml'} z +10" in errors.decode()
+    assert f"gelflow robot jog z +10 --lab {tmp_path / 'lab.toml'}" in errors.decode()
     assert expected in dict(events(tmp_path / "out" / "session.mcap"))["stopped"]["reason"]
 
 

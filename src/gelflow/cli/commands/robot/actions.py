@@ -14,7 +14,8 @@ from gelflow.cli.exit_codes import NEGATIVE_RESULT, SUCCESS
 from gelflow.cli.options import add_json, add_out
 from gelflow.cli.output import Output, yes_or_no
 from gelflow.cli.prompt import confirmed
-from gelflow.errors import UsageError
+from gelflow.cli.stop_hint import with_lab_option
+from gelflow.errors import GelflowError, UsageError
 from gelflow.interrupts import interruptible
 
 if TYPE_CHECKING:
@@ -54,8 +55,12 @@ def run(args: argparse.Namespace) -> int:
     if args.action == "status":
         return _status(args, output)
     action = _manual_action(args)
-    with _session(args, output) as session:
-        result = action(session)
+    try:
+        with _session(args, output) as session:
+            result = action(session)
+    except GelflowError as error:
+        error.args = (with_lab_option(str(error), args.lab),)
+        raise
     text = "done" if result["done"] else "nothing was sent" if args.dry_run else "not agreed: nothing more was moved"
     output.text(f"{args.action}: {text}")
     output.result({"action": args.action, "dry_run": args.dry_run, **result})

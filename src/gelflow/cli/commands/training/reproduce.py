@@ -20,7 +20,7 @@ TASKS = ("grasp", "pushing", "cap", "insertion")  # those of `gelflow.policies.r
 def configure(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
     parser.add_argument("task", choices=[*TASKS, "all"], help="task, or all of them one after another")
-    parser.add_argument("--seeds", type=int, metavar="N", help="trainings of each variant (default: 3, or 1 if short)")
+    parser.add_argument("--seeds", type=int, metavar="N", help="trainings of each variant (default: 3; with --quick 1)")
     add_seed(parser)
     add_quick(parser)
     add_out(parser, "folder of trainings and results (default runs/reproduce); the same command continues", folder=True)

@@ -50,7 +50,7 @@ _ALGORITHMS = (_DEFAULT, "ppo")
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
-    parser.add_argument("task", choices=[*TASKS, *UNTRAINED], help="task to learn; rolling is not trained")
+    parser.add_argument("task", choices=[*TASKS, *UNTRAINED], metavar="TASK", help=f"task to learn: {', '.join(TASKS)}")
     parser.add_argument("--recipe", metavar="NAME", help="settings of the training, such as paper; not for insertion")
     parser.add_argument("--steps", "--attempts", dest="attempts", type=int, metavar="N", help=_STEPS)
     parser.add_argument(
