@@ -33,11 +33,13 @@ _DECODING: dict[int, int] = {
 }
 
 _JPEG = b"\xff\xd8\xff"
+_PNG = b"\x89PNG"
+_LARGEST = 50_000_000  # of an image [pixels]
 _BIT_DEPTHS = (8, 10, 12, 14, 16)  # of cameras whose images have 16 bits per value
 
 _SAME_SPACING = 1e-3  # relative difference of two spacings, such as one by a ruler and its rounded value
 
-ENCODED = (_JPEG, b"\x89PNG")  # first bytes of JPEG and PNG files
+ENCODED = (_JPEG, _PNG)  # first bytes of JPEG and PNG files
 
 
 @dataclass(frozen=True)
@@ -260,6 +262,10 @@ def reduce_image(image: Image, reduce: Reduction) -> Image:
 
 def _decoded(data: bytes, flags: int) -> NDArray[np.uint8 | np.uint16]:
     """The decoded image. Raises UnreadableImage when there is none."""
+    height, width = _size_in_header(data)
+    if height * width > _LARGEST:  # a damaged size would occupy memory and seconds
+        size = f"{width} × {height} pixels"
+        raise UnreadableImage(f"the image states a size of {size}: truncated or damaged, or too large")
     image = _decoded_or_none(data, flags)
     if image is not None and image.dtype in (np.uint8, np.uint16):
         return image
@@ -272,6 +278,19 @@ def _decoded(data: bytes, flags: int) -> NDArray[np.uint8 | np.uint16]:
             raise UnreadableImage(f"the image has values of type {image.dtype}: convert it to 8 or 16 bits")
         problem = f"do not start like one (first bytes: {data[:8].hex(' ') or 'none'})"
     raise UnreadableImage(f"expected a JPEG or PNG image, got {len(data)} bytes that {problem}")
+
+
+def _size_in_header(data: bytes) -> tuple[int, int]:
+    """Height and width of a JPEG or PNG image without decoding it; zeros when the header has none."""
+    if data.startswith(_PNG):
+        return int.from_bytes(data[20:24]), int.from_bytes(data[16:20])
+    position = 2 if data.startswith(_JPEG) else len(data)
+    while position + 9 <= len(data) and data[position] == 0xFF:
+        marker = data[position + 1]
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # start of frame
+            return int.from_bytes(data[position + 5 : position + 7]), int.from_bytes(data[position + 7 : position + 9])
+        position += 2 + int.from_bytes(data[position + 2 : position + 4])
+    return 0, 0
 
 
 def _decoded_or_none(data: bytes, flags: int) -> NDArray[Any] | None:

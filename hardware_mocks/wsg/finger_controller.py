@@ -29,6 +29,7 @@ class MockWsgConfig:
     crc: bool = True  # False: checksums are neither checked nor sent
     fast_stop_on_disconnect: bool = True  # an unannounced TCP close raises FAST STOP
     shortest_command_interval: float = 0.0  # commands at shorter intervals are answered with OVERRUN [s]
+    stops_at_any_rate: bool = True  # False: stops at shorter intervals are answered with OVERRUN too
     serial_number: int = 50_110
 
 

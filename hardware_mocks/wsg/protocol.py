@@ -34,7 +34,6 @@ from gelflow.real.wsg.constants import (
 )
 
 _PACKET_TIMEOUT = 0.5  # an incomplete packet is abandoned after this time [s]
-_ACCEPTED_AT_ANY_RATE = (Command.STOP, Command.FAST_STOP)
 
 _WSG_50, _FIRMWARE = 1, 0x0400  # device type and firmware version
 
@@ -207,7 +206,9 @@ class WsgSession:
     def _answer(self, command: Command, payload: bytes) -> Reply:
         now = self._device.clock.now()
         since, self._last_command = now - self._last_command, now
-        if since < self._device.config.shortest_command_interval and command not in _ACCEPTED_AT_ANY_RATE:
+        config = self._device.config
+        at_any_rate = config.stops_at_any_rate and command in (Command.STOP, Command.FAST_STOP)
+        if since < config.shortest_command_interval and not at_any_rate:
             return reply(command, Status.OVERRUN)
         self.announced = command == Command.DISCONNECT
         if command == Command.LOOP:

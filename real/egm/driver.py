@@ -211,12 +211,17 @@ class EgmArm:
     def reset(self) -> None:
         """Allow motion again after a stop, on the operator's command. The reference restarts at the feedback.
 
-        Raises PeerTimeout when the EGM process does not confirm. A cause that persists stops the arm again.
+        Raises PeerTimeout when the EGM process does not confirm; it is then killed, so that the reset has no effect
+        later. A cause that persists stops the arm again.
         """
         with self._lock:
-            before = self._resets
-            self._send("reset")
-            self._wait(lambda: self._resets > before, _COMMAND_TIMEOUT, "the EGM process did not confirm the reset")
+            before, helper = self._resets, self._linked()
+            try:
+                self._send("reset")
+                self._wait(lambda: self._resets > before, _COMMAND_TIMEOUT, "the EGM process did not confirm the reset")
+            except PeerTimeout:
+                helper.kill()
+                raise
 
     def drain_log(self) -> list[EgmCycle]:
         """All cycles since the last call."""

@@ -353,8 +353,9 @@ class MotionExecutor:
         for action in (
             self.hold,
             lambda: self.supervisor.latch(reason),
+            lambda: self._gripper.forbid_motion(reason),
             lambda: self._arm.stop(reason),
-            self._stop_empty_fingers,
+            lambda: self._stop_empty_fingers(reason),
             self._log,
             lambda: self._record_checks(self._clock.now(), always=True),
         ):
@@ -364,9 +365,17 @@ class MotionExecutor:
         with contextlib.suppress(GelflowError):
             self._recorder.event("stopped", {"reason": str(self.failure), "expected": known})
 
-    def _stop_empty_fingers(self) -> None:
-        state = self._gripper.state()
-        if not self._part_expected and (fingers_move(state) or not may_hold_part(state, grasped=False)):
+    def _stop_empty_fingers(self, reason: str) -> None:
+        if self._part_expected:
+            return
+        in_motion, state = self._gripper.forbid_motion(reason), None
+        with contextlib.suppress(GelflowError):  # its data are old
+            state = self._gripper.state()
+        if in_motion:
+            free = state is None or state.grasp != "holding"
+        else:
+            free = state is not None and (fingers_move(state) or not may_hold_part(state, grasped=False))
+        if free:
             self._gripper.stop()
 
     def _raise_failure(self) -> None:

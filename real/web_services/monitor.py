@@ -2,16 +2,20 @@
 
 import contextlib
 import threading
+import time
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Self
 
+from gelflow import interrupts
 from gelflow.clock import Clock
 from gelflow.errors import GelflowError, PeerError, PeerTimeout, SafetyError, UsageError
 from gelflow.real.limits import LIMITS
 from gelflow.real.web_services.client import ControllerReading, WebServicesClient
 
 PERIOD = 0.5  # between two readings [s, robot time]
+_FIRST_READING = 12.0  # longest wait for the first reading [s, wall]
+_POLL = 0.05  # between two looks at a deferred signal [s, wall]
 _ALLOWED_MODES = ("auto", "manual reduced")
 
 
@@ -36,16 +40,30 @@ class ControllerMonitor:
         self._failure: PeerError | None = None
         self._lock = threading.Lock()
         self._ending = threading.Event()
+        self._answered = threading.Event()  # the first reading is done
         self._thread: threading.Thread | None = None
 
     def open(self) -> Self:
-        """Read the state once, then start the thread. Raises PeerError when the controller does not answer."""
+        """Start the thread and wait for its first reading.
+
+        Raises PeerError when the controller does not answer, PeerTimeout when it takes longer than 12 s.
+        """
         if self._thread is not None:
             raise UsageError("web services: already open")
         self._ending.clear()
-        self._read()
+        self._answered.clear()
+        self._failure = None
         self._thread = threading.Thread(target=self._run, name="web services", daemon=True)
         self._thread.start()
+        deadline = time.monotonic() + _FIRST_READING
+        # In the thread, since the time-out of the client bounds each wait only, and a slow answer has many of them.
+        while not self._answered.wait(_POLL):
+            if interrupts.is_pending() or time.monotonic() > deadline:
+                self.close()
+                raise PeerTimeout(f"web services: {self._client.address} has not answered completely")
+        if (failure := self._failure) is not None:
+            self.close()
+            raise failure
         return self
 
     def close(self) -> None:
@@ -112,10 +130,12 @@ class ControllerMonitor:
                 raise SafetyError(f"the {name} changed from {old} to {new}; start a new run when it is restored")
 
     def _run(self) -> None:
-        while not self._ending.wait(self._clock.wall(PERIOD)):
+        while not self._ending.is_set():
             with contextlib.suppress(GelflowError):  # `state` raises it when no newer reading succeeds
                 self._read()
-        self._client.logout()
+            self._answered.set()
+            self._ending.wait(self._clock.wall(PERIOD))
+        self._client.logout()  # after a failed first reading too, which may have begun a session
 
     def _read(self) -> None:
         asked = self._clock.now()

@@ -124,4 +124,20 @@ HOME_INWARDS = 2
 SHORTEST_PERIOD, LONGEST_PERIOD = 0.010, 9.999  # of updates [s]
 
 STATE_COMMANDS = (Command.SYSTEM_STATE, Command.GRASP_STATE, Command.WIDTH, Command.SPEED, Command.FORCE)
+# Results of a motion that has started; any other status refuses one.
+RESULTS = (Status.SUCCESS, Status.TIMEOUT, Status.CMD_FAILED, Status.CMD_ABORTED, Status.AXIS_BLOCKED)
+_MEANINGS = {
+    Status.CMD_FAILED: "no part was between the fingers",
+    Status.AXIS_BLOCKED: "the fingers were blocked before their target",
+    Status.ACCESS_DENIED: "motion is locked by FAST STOP or by another client",
+    Status.NOT_INITIALIZED: "home it first",
+    Status.ALREADY_RUNNING: "it is moving or holds a part",
+    Status.CMD_ABORTED: "it was stopped",
+    Status.RANGE_ERROR: "outside the hardware limits or the soft limits",
+}
 MOTIONS = (Command.HOME, Command.PRE_POSITION, Command.GRASP, Command.RELEASE)
+
+
+def meaning(status: Status) -> str:
+    """What the status of a refused or failed motion means, for errors."""
+    return _MEANINGS.get(status, "see the device's manual")

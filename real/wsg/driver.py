@@ -30,7 +30,7 @@ from gelflow.real.wsg.checks import (
 )
 from gelflow.real.wsg.codec import Packet, Reply
 from gelflow.real.wsg.config import WsgConfig, WsgLimits, narrowed
-from gelflow.real.wsg.constants import HOME_OUTWARDS, STATE_COMMANDS, Command, Status, UpdateMode
+from gelflow.real.wsg.constants import HOME_OUTWARDS, STATE_COMMANDS, Command, Status, UpdateMode, meaning
 from gelflow.real.wsg.link import WsgLink, WsgRefused
 from gelflow.real.wsg.state import StateAssembler
 
@@ -38,17 +38,6 @@ _log = logging.getLogger(__name__)
 _log.addHandler(logging.NullHandler())  # silent unless the program configures logging
 _WSG_50 = 1  # device type
 _FORCE_TOLERANCE = 0.5  # between the requested and the confirmed force limit [N]
-
-_MEANING = {
-    Status.CMD_FAILED: "no part was between the fingers",
-    Status.AXIS_BLOCKED: "the fingers were blocked before their target",
-    Status.ACCESS_DENIED: "motion is locked by FAST STOP or by another client",
-    Status.NOT_INITIALIZED: "home it first",
-    Status.ALREADY_RUNNING: "it is moving or holds a part",
-    Status.CMD_ABORTED: "it was stopped",
-    Status.RANGE_ERROR: "outside the hardware limits or the soft limits",
-}
-
 
 OnCommand = Callable[[str, Mapping[str, float]], None]
 OnMeasurement = Callable[[GripperState], None]
@@ -83,6 +72,8 @@ class WsgGripper:
         self._acknowledged = 0  # packets with a wrong checksum that an operator has acknowledged
         self._moving = threading.Lock()
         self._grasped = False
+        self._stop_lost = False  # the last stop was not confirmed
+        self._forbidden = ""  # the reason of `forbid_motion`
 
     def __enter__(self) -> "WsgGripper":
         self.connect()
@@ -105,8 +96,8 @@ class WsgGripper:
         config = self._config
         self._values = StateAssembler()
         self._acknowledged = 0
-        self._grasped = False
-        link = WsgLink(
+        self._grasped, self._stop_lost, self._forbidden = False, False, ""
+        self._link = link = WsgLink(
             self._transport,
             clock=self._clock,
             on_update=self._take_update,
@@ -114,7 +105,6 @@ class WsgGripper:
             command_interval=config.command_interval,
             crc=config.crc,
         )
-        self._link = link
         try:
             link.open()
             kind, _, firmware, serial = link.request(Packet(Command.DEVICE_INFO)).values()
@@ -137,7 +127,8 @@ class WsgGripper:
     def close(self, *, reason: str = "closed by the program") -> None:
         """Stop the fingers, announce the disconnect, close. May be called twice; errors are logged, not raised.
 
-        While a part is held and nothing moves, no stop is sent, because a stop ends the device's grip.
+        While a part is held and nothing moves, no stop is sent, because a stop ends the device's grip. A stop that was
+        not confirmed is repeated.
         """
         link, self._link = self._link, None
         if link is None:
@@ -145,17 +136,15 @@ class WsgGripper:
         _log.info("disconnecting from the gripper at %s: %s", link.address, reason)
         with self._changed:
             state = self._values.state(corrupt=False) if self._values.complete else None
-        held = state is not None and self._holds(state) and not fingers_move(state)
+        held = state is not None and self._holds(state) and not fingers_move(state) and not self._stop_lost
         try:
-            commands = [("disconnect", Command.DISCONNECT)]
             if (self._moving.locked() or not held) and not self._config.dry_run:
-                commands.insert(0, ("stop", Command.STOP))
-            for name, command in commands:
-                try:
-                    link.request(Packet(command), urgent=command == Command.STOP)
-                    self._record(name, {})
-                except GelflowError as error:
-                    _log.error("%s while disconnecting from the gripper: %s", name, error)
+                self._stop_twice(link)
+            try:
+                link.request(Packet(Command.DISCONNECT))
+                self._record("disconnect", {})
+            except GelflowError as error:
+                _log.error("disconnect from the gripper: %s", error)
         finally:
             link.close()
 
@@ -262,11 +251,21 @@ class WsgGripper:
 
     def stop(self) -> None:
         """Stop the fingers. The device also ceases to monitor a held part. No effect in a dry run."""
-        self._stop("stop", Command.STOP)
+        self._stop(self._connected(), "stop", Command.STOP)
 
     def fast_stop(self) -> None:
         """Stop at once and lock every motion until `acknowledge_fault`. No effect in a dry run."""
-        self._stop("fast stop", Command.FAST_STOP)
+        self._stop(self._connected(), "fast stop", Command.FAST_STOP)
+
+    def forbid_motion(self, reason: str) -> bool:
+        """Refuse every motion until `close`, also one that is prepared and not sent yet. Sends nothing.
+
+        Returns whether a motion is in progress: `stop` ends it.
+        """
+        self._forbidden = self._forbidden or reason
+        if self._link is not None:
+            self._link.refuse_prepared()
+        return self._moving.locked()
 
     def acknowledge_fault(self) -> None:
         """Unlock motion after an operator has inspected the fault. Nothing in gelflow calls this by itself.
@@ -331,7 +330,6 @@ class WsgGripper:
         self._await(agreed, f"report that it is {what}")
 
     def _ready(self, name: str, *, referenced: bool = True) -> GripperState:
-        self._connected()
         state = self.state()
         check_ready(name, state, referenced=referenced)
         return state
@@ -348,6 +346,8 @@ class WsgGripper:
         if not self._moving.acquire(blocking=False):
             raise SafetyError(f"{name} refused: another motion is in progress; stop it or wait")
         try:
+            if self._forbidden:
+                raise SafetyError(f"{name} refused: {self._forbidden}")
             self._record(name, values)
             if self._config.dry_run:
                 return
@@ -356,18 +356,21 @@ class WsgGripper:
             self._grasped = self._grasped or packet.id == Command.GRASP
             try:
                 reply, pending = link.run(packet, timeout=timeout, stops=stops)
+            except WsgRefused:  # it was not sent, and a stop would end the grip of a part
+                raise
             except BaseException as error:
-                self._stop_after(name, f"{type(error).__name__}: {error}")
+                _log.error("stopping the gripper: %s failed (%s: %s)", name, type(error).__name__, error)
+                self._stop_twice(link)
                 raise
             if reply.status == Status.SUCCESS:
                 return
             if pending and reply.status not in (Status.CMD_FAILED, Status.CMD_ABORTED):
-                self._stop_after(name, reply.status.name)  # blocked fingers would continue to push
+                _log.error("stopping the gripper: %s failed (%s)", name, reply.status.name)
+                self._stop_twice(link)  # blocked fingers would continue to push
             if pending:
                 with contextlib.suppress(PeerError):
                     self._settle(lambda _: True, "alive")  # so that `state` shows the result
-            meaning = _MEANING.get(reply.status, "see the device's manual")
-            text = f"the gripper ended {name} with {reply.status.name}: {meaning}"
+            text = f"the gripper ended {name} with {reply.status.name}: {meaning(reply.status)}"
             raise WsgRefused(text, status=reply.status, pending=pending)
         finally:
             self._moving.release()
@@ -378,20 +381,20 @@ class WsgGripper:
         if abs(confirmed - force) > _FORCE_TOLERANCE:
             raise PeerRefused(f"the gripper limits its force to {confirmed:.1f} N, expected {force:.1f} N: not moving")
 
-    def _stop(self, name: str, command: Command) -> None:
-        link = self._connected()
+    def _stop(self, link: WsgLink, name: str, command: Command, *, urgent: bool = True) -> None:
+        self._stop_lost = not self._config.dry_run
         try:
             if not self._config.dry_run:
-                link.request(Packet(command), urgent=True)
+                link.request(Packet(command), urgent=urgent)
+                self._stop_lost = False
         finally:
             self._record(name, {})  # after the command, because a stop must not wait for the recorder
 
-    def _stop_after(self, name: str, reason: str) -> None:
-        """Stop because `name` failed. Errors of the stop are logged, so that the first error is the one raised."""
-        _log.error("stopping the gripper: %s failed (%s)", name, reason)
-        for _ in range(2):  # a damaged command is not executed
+    def _stop_twice(self, link: WsgLink) -> None:
+        """Stop, again after the pause between commands if it is not confirmed: it was damaged, or came too early."""
+        for urgent in (True, False):
             try:
-                self._stop("stop", Command.STOP)
+                self._stop(link, "stop", Command.STOP, urgent=urgent)
                 return
             except GelflowError as error:
                 _log.error("the stop was not confirmed: %s", error)

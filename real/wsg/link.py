@@ -15,7 +15,7 @@ from gelflow.clock import Clock
 from gelflow.errors import GelflowError, PeerError, PeerRefused, PeerTimeout
 from gelflow.real.transport import SHORTEST_WALL_TIMEOUT, Transport
 from gelflow.real.wsg.codec import Corrupt, Decoder, Packet, Reply, parse_reply, plausible_reply
-from gelflow.real.wsg.constants import STATE_COMMANDS, Command, Status
+from gelflow.real.wsg.constants import RESULTS, STATE_COMMANDS, Command, Status
 
 _log = logging.getLogger(__name__)
 _log.addHandler(logging.NullHandler())  # silent unless the program configures logging
@@ -24,7 +24,10 @@ _PACKET_TIMEOUT = 0.5  # an incomplete packet is abandoned after this time [s]; 
 
 
 class WsgRefused(PeerRefused):
-    """The gripper answered with a status other than success; `pending` when it had started the motion."""
+    """The gripper answered with a status other than success, or the motion was not sent after a stop.
+
+    `pending`: it had started the motion.
+    """
 
     def __init__(self, text: str, *, status: Status, pending: bool = False) -> None:
         super().__init__(text)
@@ -66,7 +69,7 @@ class WsgLink:
         self._ending = threading.Event()
         self._thread: threading.Thread | None = None
         self.corrupt = 0
-        self.stops = 0  # that were sent
+        self.stops = 0  # that were sent, and calls of `refuse_prepared`
 
     @property
     def address(self) -> str:
@@ -107,46 +110,59 @@ class WsgLink:
             raise WsgRefused(text, status=reply.status)
         return reply
 
-    def send(self, packet: Packet, *, urgent: bool = False, stops: int | None = None) -> None:
+    def send(
+        self, packet: Packet, *, urgent: bool = False, stops: int | None = None, inbox: deque[Reply] | None = None
+    ) -> None:
         """Send a command without waiting for a reply, after the pause between commands unless it is `urgent`.
 
-        Raises PeerError when the transport is broken, and PeerRefused when more than `stops` stops were sent.
+        Earlier replies are removed from `inbox` in the moment of sending. Raises PeerError when the transport is
+        broken, and WsgRefused when there were more than `stops` stops.
         """
         if urgent:
             self._write(packet)
             return
         with self._pacing:
             self._clock.sleep(self._last_write + self._interval - self._clock.now())
-            self._write(packet, stops)
+            self._write(packet, stops, inbox)
+
+    def refuse_prepared(self) -> None:
+        """Refuse motions that are prepared and not sent yet, as after a stop. Sends nothing."""
+        with self._writing:
+            self.stops += 1
 
     def run(self, packet: Packet, *, timeout: float, stops: int) -> tuple[Reply, bool]:
         """Send a motion and wait for its result; returns the final reply and whether the motion had started.
 
-        `stops` is the number of stops when the motion was prepared. Raises PeerRefused when another one was sent since,
+        `stops` is the number of stops when the motion was prepared. Raises WsgRefused when another one came since,
         PeerTimeout without a first reply within the reply time-out or a result within `timeout` [s].
         """
         pending = False
         with self._inbox(Command(packet.id)) as inbox:
-            self.send(packet, stops=stops)
-            deadline = self._clock.now() + timeout
+            self.send(packet, stops=stops, inbox=inbox)
+            sent = self._clock.now()
             while True:
-                reply = self._take(inbox, packet, deadline - self._clock.now() if pending else self._reply_timeout)
+                passed = self._clock.now() - sent
+                reply = self._take(inbox, packet, (timeout if pending else self._reply_timeout) - passed)
                 if reply.status == Status.CMD_PENDING:
-                    if pending and self._clock.now() > deadline:
+                    if pending and self._clock.now() > sent + timeout:
                         raise self._no_answer(packet)
                     pending = True
-                elif pending or reply.status != Status.SUCCESS:
+                elif pending or reply.status not in RESULTS:
                     return reply, pending
-                # A success before the motion is pending repeats the result of an earlier command.
+                # A result before the motion is pending is that of an earlier command, or the first reply was lost.
 
-    def _write(self, packet: Packet, stops: int | None = None) -> None:
+    def _write(self, packet: Packet, stops: int | None = None, inbox: deque[Reply] | None = None) -> None:
         with self._writing:
             if self._broken:
                 raise self._failure_copy()
             if packet.id in (Command.STOP, Command.FAST_STOP):
                 self.stops += 1
             elif stops is not None and stops != self.stops:
-                raise PeerRefused(f"the gripper was stopped before {Command(packet.id).name} was sent")
+                text = f"the gripper was stopped before {Command(packet.id).name} was sent"
+                raise WsgRefused(text, status=Status.CMD_ABORTED)
+            if inbox is not None:
+                with self._condition:
+                    inbox.clear()
             try:
                 self._transport.write(packet.encode(crc=self._crc))
             except PeerError as error:

@@ -101,7 +101,10 @@ class HelperProcess:
 
     @classmethod
     def start(cls, module: str, settings: dict[str, Any], *, descriptors: Sequence[int] = ()) -> "HelperProcess":
-        """Run `python -m module`, which obtains `settings` and the open file descriptors from `connect_to_parent`."""
+        """Run `python -m module`, which obtains `settings` and the open file descriptors from `connect_to_parent`.
+
+        Modules of the working folder are not importable in it, as in the `gelflow` command.
+        """
         ours, theirs = socket.socketpair()
         errors = tempfile.TemporaryFile()  # noqa: SIM115  (closed in close)
         numbers = (theirs.fileno(), *descriptors)
@@ -109,7 +112,7 @@ class HelperProcess:
         paths = (str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", ""))
         try:
             process = subprocess.Popen(
-                [sys.executable, "-m", module, json.dumps(settings), *map(str, numbers)],
+                [sys.executable, "-P", "-m", module, json.dumps(settings), *map(str, numbers)],
                 pass_fds=numbers,
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,

@@ -160,6 +160,10 @@ class Gripper(Protocol):
         """Stop the motion of the fingers."""
         ...
 
+    def forbid_motion(self, reason: str) -> bool:
+        """Refuse every motion until `close`, also one that is not sent yet; returns whether one is in progress."""
+        ...
+
     def close(self) -> None:
         """Announce the disconnect, then close."""
         ...

@@ -171,6 +171,8 @@ class TomlTable:
         value = self._get(key, default)
         if not isinstance(value, str):
             raise UsageError(f"{self.location}: {key} must be a string, got {value!r}")
+        if "\0" in value:
+            raise UsageError(f"{self.location}: {key} must not contain the character NUL, got {value!r}")
         if choices is not None and value not in choices:
             new_value = (renamed or {}).get(value)
             hint = f"it is now called {new_value!r}" if new_value else suggestion(value, choices)

@@ -112,3 +112,15 @@ def test_workers_end_with_their_parent(number: signal.Signals, tmp_path: Path) -
     while is_running(worker) and time.monotonic() < end:
         time.sleep(0.05)
     assert not is_running(worker)
+
+
+def test_a_helper_imports_no_module_of_the_working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "argparse.py").write_text("raise SystemExit('a file of the working folder')\n")
+    monkeypatch.chdir(tmp_path)
+    helper = HelperProcess.start("argparse", {})
+    end = time.monotonic() + 30
+    while helper.running:
+        assert time.monotonic() < end
+        time.sleep(0.01)
+    assert "a file of the working folder" not in helper.exit_reason()
+    helper.close()

@@ -150,3 +150,16 @@ def test_a_reduced_image_of_any_size_keeps_positions(reduce: Reduction, suffix: 
     down, right = (float((weights * at).sum() / weights.sum()) for at in np.indices(reduced.shape))
     exact = [(at + 0.5) / reduce - 0.5 for at in (660, 1010)]
     assert [right, down] == pytest.approx(exact, abs=0.02)
+
+
+@pytest.mark.parametrize("encoding", ["jpg", "png"])
+def test_a_damaged_size_is_refused_without_decoding(encoding: str) -> None:
+    picture = np.random.default_rng(0).integers(0, 255, (40, 60, 3), dtype=np.uint8)
+    data = bytearray(cv2.imencode(f".{encoding}", picture)[1].tobytes())
+    if encoding == "jpg":
+        start = data.find(b"\xff\xc0")
+        data[start + 5 : start + 9] = (20_000).to_bytes(2) * 2
+    else:
+        data[16:24] = (20_000).to_bytes(4) * 2
+    with pytest.raises(PeerError, match="states a size of 20000 × 20000 pixels"):
+        decode_image(bytes(data))

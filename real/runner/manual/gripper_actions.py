@@ -62,7 +62,10 @@ def open_fingers(session: Session) -> Result:
 
 
 def acknowledge(session: Session) -> Result:
-    """Acknowledge the fault of the gripper after an operator has inspected it. Nothing is sent without a fault."""
+    """Acknowledge the fault of the gripper after an operator has inspected it. Nothing is sent without a fault.
+
+    Raises SafetyError when it reports another fault after the answer than before the question.
+    """
     with _gripper(session) as gripper:
         state = gripper.state()
         if not state.fault:
@@ -72,6 +75,11 @@ def acknowledge(session: Session) -> Result:
         question = f"After the acknowledgement of {state.fault} the fingers can move again. Is the cause removed?"
         if not session.agreed(question, gripper.state):
             return {"done": False, "state": state, "fault": state.fault}
+        if (now := gripper.state().fault) != state.fault:
+            raise SafetyError(
+                f"acknowledge refused: the gripper reports {now or 'no fault'} now, and {state.fault} before the "
+                "question; look at the fingers, and start again"
+            )
         gripper.acknowledge_fault()
         return {"done": True, "state": gripper.state(), "fault": state.fault}
 

@@ -119,7 +119,7 @@ def test_killed_egm_process_is_detected(cell: ArmAndMock) -> None:
 
 def test_egm_process_ignores_interrupts(cell: ArmAndMock) -> None:
     assert cell.arm.pid is not None
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT):
         os.kill(cell.arm.pid, number)
     cell.clock.sleep(0.1)
     cell.go(near_start(0.001, 0, 0))

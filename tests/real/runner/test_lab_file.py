@@ -116,6 +116,8 @@ def test_a_saved_lab_file_with_any_name_is_read_back(tmp_path: Path) -> None:
         ("pixels_per_mm = 15.7", 'calibration = "none.json"', "lab.toml, cameras.left: cannot read"),
         ("# stale_pose = 0.020", "stale_pose = 0", "lab.toml: limits.stale_pose must be 0.008 to 0.1 s, got 0"),
         ("format = 1", "format = 1\ncameras = 3", "not valid TOML"),
+        ('# gel = "" ', r'gel = "a\u0000b" #', "lab.toml, cameras.left: gel must not contain the character NUL"),
+        ("http://192.168.1.30", r"uvc:/dev/vid\u0000eo", "cameras.left: source must not contain the character NUL"),
         ("serial:/dev/ttyUSB0", "tcp:192.168.1..20:1000", "lab.toml, gripper: a TCP address needs a valid host and a"),
         ("serial:/dev/ttyUSB0", "tcp:192.168.1.20", "gripper: address 'tcp:192.168.1.20' is neither tcp:HOST:PORT"),
         ("http://192.168.1.30", "http://192.168.1..30", "cameras.left: camera source: expected http://HOST:PORT/path"),

@@ -13,10 +13,10 @@ from typing import Any
 
 import pytest
 from tests.real.runner.harness import BackgroundRun, OraclePolicy, events, moving, plan_for, wait_for
-from tests.real.wsg.harness import Relay, connected, unmodified
+from tests.real.wsg.harness import Relay, connected, eventually, unmodified
 
 from gelflow.cli.main import main
-from gelflow.errors import GelflowError
+from gelflow.errors import GelflowError, SafetyError
 from gelflow.hardware_mocks.robot import MockRobot
 from gelflow.mock_lab.lab import lab_for
 from gelflow.real.runner.lab_file import save_lab
@@ -186,7 +186,8 @@ def test_fast_stop_is_acknowledged_by_an_operator_only(robot: MockRobot, operato
     for action in (["home", "--yes"], ["open", "--yes"], ["jog", "z", "2", "--yes"]):
         code, _ = operator.run(*action)
         assert code == 2, action
-        assert "reports FAST_STOP; inspect it, then use: gelflow robot acknowledge" in operator.errors
+        command = f"gelflow robot acknowledge --lab {operator.lab}"
+        assert f"reports FAST_STOP; inspect it, then use: {command}" in operator.errors
     code, printed = operator.run("acknowledge", answers="n\n")
     assert code == 1 and "reports FAST_STOP" in printed
     code, _ = operator.run("acknowledge")
@@ -197,6 +198,23 @@ def test_fast_stop_is_acknowledged_by_an_operator_only(robot: MockRobot, operato
     assert code == 0 and not robot.gripper.fast_stopped
     code, printed = operator.run("acknowledge", "--yes")
     assert code == 0 and "reports no fault" in printed
+
+
+def test_only_the_fault_that_the_operator_was_asked_about_is_acknowledged(monkeypatch: pytest.MonkeyPatch) -> None:
+    with connected() as (gripper, server, _, record):
+        server.raise_fast_stop()
+        eventually(lambda: gripper.state().fault == "FAST_STOP", "FAST STOP did not appear in the state")
+        state = gripper.state
+        monkeypatch.setattr(gripper_actions, "_gripper", lambda session: contextlib.nullcontext(gripper))
+
+        def agreed(question: str, check: object) -> bool:
+            monkeypatch.setattr(gripper, "state", lambda: dataclasses.replace(state(), fault="FINGER_FAULT"))
+            return True
+
+        session: Any = SimpleNamespace(say=lambda text: None, agreed=agreed)
+        with pytest.raises(SafetyError, match="reports FINGER_FAULT now, and FAST_STOP before the question"):
+            gripper_actions.acknowledge(session)
+        assert server.fast_stopped and "acknowledge fault" not in record.names
 
 
 def test_gripper_that_is_not_homed_is_homed_outwards_after_the_question(robot: MockRobot, operator: Operator) -> None:

@@ -44,7 +44,7 @@ def running(arguments: list[str], **streams: Any) -> Iterator["subprocess.Popen[
         process.wait()
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT])
 def test_signal_stops_the_arm_and_closes_everything(robot: MockRobot, tmp_path: Path, number: signal.Signals) -> None:
     with running(command(robot, tmp_path), stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL) as process:
         wait_for(lambda: moving(robot) or process.poll() is not None)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from tests.real.runner.harness import events
 
+from gelflow.errors import PeerError, PeerTimeout
 from gelflow.hardware_mocks.robot import MockRobot
 from gelflow.mock_lab.lab import lab_for
 from gelflow.real.egm.driver import EgmArm
@@ -55,6 +56,22 @@ def test_the_state_is_readable_during_a_stop(robot: MockRobot) -> None:
             assert not arm.state().fault
         stopping.join()
         assert arm.state().fault == "the test stops it"
+
+
+def test_a_reset_that_is_not_confirmed_has_no_effect_later(robot: MockRobot) -> None:
+    lab = lab_for(robot)
+    with EgmArm(egm_config(lab), clock=lab.clock) as arm:
+        arm.wait_following(60.0)
+        arm.stop("the operator pressed stop")
+        pid = arm.pid
+        assert pid is not None
+        os.kill(pid, signal.SIGSTOP)
+        with pytest.raises(PeerTimeout, match="did not confirm the reset"):
+            arm.reset()
+        os.kill(pid, signal.SIGCONT)
+        time.sleep(0.2)
+        with pytest.raises(PeerError, match="nothing is sent to the robot any more"):
+            arm.state()
 
 
 def test_the_hold_of_an_interrupted_run_is_recorded(robot: MockRobot, tmp_path: Path) -> None:

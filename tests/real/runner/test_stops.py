@@ -8,13 +8,16 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from tests.real.runner.harness import BackgroundRun, OraclePolicy, events, moving, plan_for, wait_for
 
-from gelflow.errors import GelflowError, SafetyError
+from gelflow.errors import GelflowError, PeerTimeout, SafetyError
 from gelflow.hardware_mocks.robot import MockRobot
 from gelflow.mock_lab.lab import lab_for
+from gelflow.protocols import GripperState
 from gelflow.real.runner.lab_file import save_lab
 from gelflow.real.runner.motion_executor import MotionExecutor
 from gelflow.real.runner.run_plan import run_insertions
@@ -56,6 +59,43 @@ def test_stale_data_or_a_fault_holds_the_arm_and_ends_the_run(
     recorded = dict(events(plan.session))
     assert expected.lower() in recorded["stopped"]["reason"].lower()
     assert recorded["arm timing"]["cycles"] > 100 and 0 <= recorded["arm timing"]["missed"] < 1
+
+
+@pytest.mark.parametrize(
+    ("expected", "in_motion", "grasp", "force", "stopped"),
+    [
+        (False, False, "idle", 0.0, True),
+        (False, False, "grasping", 0.0, True),
+        (False, False, "idle", 6.0, False),  # they press on something
+        (False, False, "holding", 12.0, False),
+        (False, False, None, 0.0, False),
+        (False, True, "idle", 6.0, True),  # the device reports the motion later, or it is being prepared
+        (False, True, "holding", 12.0, False),  # the grasp has ended
+        (False, True, None, 0.0, True),  # nothing is received any more
+        (True, True, "releasing", 12.0, False),
+    ],
+)
+def test_fingers_stop_with_the_arm_unless_they_may_hold_a_part(
+    expected: bool, in_motion: bool, grasp: str | None, force: float, stopped: bool
+) -> None:
+    calls: list[str] = []
+
+    class Fingers:
+        def forbid_motion(self, reason: str) -> bool:
+            calls.append(reason)
+            return in_motion
+
+        def state(self) -> GripperState:
+            if grasp is None:
+                raise PeerTimeout("the gripper's state is old")
+            return GripperState(0.05, 0.0, force, True, grasp, "", 0.0)
+
+        def stop(self) -> None:
+            calls.append("stop")
+
+    executor: Any = SimpleNamespace(_part_expected=expected, _gripper=Fingers())
+    MotionExecutor._stop_empty_fingers(executor, "why")
+    assert ("stop" in calls) == stopped
 
 
 def test_a_requested_stop_holds_the_arm_at_once_and_ends_the_run(robot: MockRobot, tmp_path: Path) -> None:

@@ -1,5 +1,8 @@
 """Monitor of the controller's state: it approves a state, and every change of it is an error."""
 
+import contextlib
+import socket
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -7,8 +10,9 @@ from contextlib import contextmanager
 import pytest
 
 from gelflow.clock import ScaledClock
-from gelflow.errors import PeerError, PeerRefused, SafetyError, UsageError
+from gelflow.errors import PeerError, PeerRefused, PeerTimeout, SafetyError, UsageError
 from gelflow.hardware_mocks.web_services.device import MockWebServices
+from gelflow.real.web_services import monitor as monitor_module
 from gelflow.real.web_services.client import WebServicesClient
 from gelflow.real.web_services.monitor import ControllerMonitor
 
@@ -109,6 +113,39 @@ def test_unreachable_controller_cannot_be_opened() -> None:
     with pytest.raises(UsageError, match="open the monitor"):
         monitor.state()
     monitor.close()
+
+
+def test_a_failed_opening_ends_its_session() -> None:
+    with MockWebServices() as server:
+        server.broken = b"<html>"
+        with pytest.raises(PeerError, match="expected an answer with opmode"):
+            ControllerMonitor(WebServicesClient(server.url), CLOCK).open()
+        end = time.monotonic() + PATIENT
+        while server.sessions:
+            assert time.monotonic() < end
+            time.sleep(0.01)
+
+
+def test_an_answer_that_never_ends_does_not_block_the_opening(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each byte comes within the time-out of the client."""
+    monkeypatch.setattr(monitor_module, "_FIRST_READING", 0.5)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        ended = threading.Event()
+
+        def drip() -> None:
+            link, _ = server.accept()
+            with link, contextlib.suppress(OSError):
+                link.sendall(b"HTTP/1.1 200 OK\r\nX-Endless: ")
+                while not ended.wait(0.05):
+                    link.sendall(b"a")
+
+        thread = threading.Thread(target=drip, daemon=True)
+        thread.start()
+        client = WebServicesClient(f"http://127.0.0.1:{server.getsockname()[1]}", timeout=0.5)
+        with pytest.raises(PeerTimeout, match="has not answered completely"):
+            ControllerMonitor(client, CLOCK).open()
+        ended.set()
+        thread.join(PATIENT)
 
 
 def test_session_is_ended() -> None:

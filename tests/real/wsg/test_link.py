@@ -76,6 +76,44 @@ def test_bad_checksum_is_a_fault_until_acknowledged() -> None:
         gripper.move(width=0.1, speed=0.4)
 
 
+def test_a_result_that_arrives_after_the_next_command_is_not_taken_for_its_result() -> None:
+    late = threading.Event()
+
+    def with_late_result(data: bytes) -> Iterable[bytes]:
+        if late.is_set() and reply(Command.PRE_POSITION, Status.CMD_PENDING).encode() in data:
+            late.clear()
+            return [reply(Command.PRE_POSITION, Status.CMD_ABORTED).encode(), data]
+        return [data]
+
+    with relayed(with_late_result) as (gripper, relay, plant):
+        gripper.home()
+        late.set()
+        gripper.move(width=0.060, speed=0.4)
+        assert not late.is_set() and plant.gripper_state()[0] == pytest.approx(0.060)
+        assert Command.STOP not in relay.ids()
+
+
+def test_a_result_without_a_first_reply_ends_with_a_stop() -> None:
+    """The fingers are blocked and would continue to push."""
+    lost = threading.Event()
+
+    def swallow(data: bytes) -> Iterable[bytes]:
+        pending = reply(Command.PRE_POSITION, Status.CMD_PENDING).encode()
+        if lost.is_set() and pending in data:
+            lost.clear()
+            return [data.replace(pending, b"")]
+        return [data]
+
+    impatient = WsgConfig(reply_timeout=2.0, move_timeout=6.0, home_timeout=50.0, stale_after=3.0)
+    with relayed(swallow, config=impatient) as (gripper, relay, plant):
+        gripper.home()
+        plant.set_part(0.100)
+        lost.set()
+        with pytest.raises(PeerTimeout, match="PRE_POSITION"):
+            gripper.move(width=0.060, speed=0.4)
+        assert not lost.is_set() and relay.ids()[-2:] == [Command.PRE_POSITION, Command.STOP]
+
+
 class TimedTransport(TcpTransport):
     """A TCP connection that records each write and its time."""
 

@@ -4,7 +4,9 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
 
 import pytest
 from tests.real.wsg.harness import (
@@ -22,6 +24,7 @@ from tests.real.wsg.harness import (
 )
 
 from gelflow.errors import PeerError, PeerRefused, PeerTimeout, SafetyError
+from gelflow.hardware_mocks.wsg.finger_controller import MockWsgConfig
 from gelflow.interrupts import Interrupted, interruptible
 from gelflow.protocols import GripperState
 from gelflow.real.transport import transport_for
@@ -79,6 +82,98 @@ def test_a_stop_while_the_force_limit_is_set_prevents_the_grasp(monkeypatch: pyt
         assert plant.gripper_state()[0] == pytest.approx(0.110) and gripper.state().grasp == "idle"
 
 
+def test_forbidden_motions_are_not_sent(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither later ones nor one that is being prepared, and without a stop, which would end the grip of a part."""
+    with connected() as (gripper, _, plant, record):
+        gripper.home()
+        limit_force = gripper._limit_force
+
+        def forbidden(link: WsgLink, force: float) -> None:
+            limit_force(link, force)
+            assert gripper.forbid_motion("the operator pressed stop")
+
+        monkeypatch.setattr(gripper, "_limit_force", forbidden)
+        with pytest.raises(PeerRefused, match="the gripper was stopped before GRASP was sent"):
+            gripper.grasp(width=0.040, speed=0.4, force=20)
+        motions: list[Callable[[], None]] = [
+            lambda: gripper.home(part_removed=True),
+            lambda: gripper.move(width=0.04, speed=0.4),
+            lambda: gripper.release(width=0.110, speed=0.1),
+        ]
+        for motion in motions:
+            with pytest.raises(SafetyError, match="refused: the operator pressed stop"):
+                motion()
+        assert not gripper.forbid_motion("later")
+        assert record.names == ["home", "grasp"] and plant.gripper_state()[0] == pytest.approx(0.110)
+
+
+def test_a_release_that_is_forbidden_before_it_is_sent_keeps_the_grip(monkeypatch: pytest.MonkeyPatch) -> None:
+    with connected() as (gripper, _, plant, record):
+        gripper.home()
+        plant.set_part(0.040)
+        gripper.grasp(width=0.040, speed=0.4, force=20)
+        link = gripper._link
+        assert link is not None
+        send = link.send
+
+        def forbidden(packet: Packet, **options: Any) -> None:
+            gripper.forbid_motion("the operator pressed stop")
+            send(packet, **options)
+
+        monkeypatch.setattr(link, "send", forbidden)
+        with pytest.raises(PeerRefused, match="the gripper was stopped before RELEASE was sent"):
+            gripper.release(width=0.110, speed=0.1)
+        assert record.names[-1] == "release" and gripper.state().grasp == "holding"
+
+
+def test_a_stop_that_came_too_early_is_sent_again_after_the_pause(monkeypatch: pytest.MonkeyPatch) -> None:
+    device = MockWsgConfig(shortest_command_interval=0.1, stops_at_any_rate=False)
+    with connected(device=device, config=replace(CONFIG, command_interval=0.5)) as (gripper, _, plant, record):
+        gripper.home()
+        link = gripper._link
+        assert link is not None
+
+        def no_result(packet: Packet, *, timeout: float, stops: int) -> None:
+            link.send(packet)
+            raise PeerTimeout("no result")
+
+        monkeypatch.setattr(link, "run", no_result)
+        with pytest.raises(PeerTimeout):
+            gripper.grasp(width=0.010, speed=0.005, force=20)
+        assert record.names[-1] == "stop" and record.names.count("stop") <= 2  # one if this computer was interrupted
+        eventually(lambda: plant.gripper_state()[1] == 0.0, "the fingers were not stopped")
+        assert plant.gripper_state()[0] > 0.09
+
+
+def test_close_repeats_a_stop_that_was_not_confirmed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Although a part may be held, by the state from before the grasp."""
+    with connected() as (gripper, _, plant, record):
+        gripper.home()
+        link = gripper._link
+        assert link is not None
+        idle = gripper.state()
+
+        def lost(packet: Packet, **_: object) -> None:
+            raise PeerTimeout("no answer")
+
+        def no_result(packet: Packet, **_: object) -> None:
+            link.send(packet)
+            raise PeerTimeout("no result")
+
+        with monkeypatch.context() as silent:
+            silent.setattr(link, "request", lost)
+            silent.setattr(gripper, "_limit_force", lambda link, force: None)
+            silent.setattr(link, "run", no_result)
+            with pytest.raises(PeerTimeout):
+                gripper.grasp(width=0.010, speed=0.005, force=20)
+        monkeypatch.setattr(gripper._values, "state", lambda corrupt: idle)
+        gripper.close()
+        assert record.names[-2:] == ["stop", "disconnect"]
+        width = plant.gripper_state()[0]
+        time.sleep(0.05)
+        assert plant.gripper_state()[0] == width > 0.09
+
+
 def test_close_during_a_motion_stops_the_fingers() -> None:
     with connected() as (gripper, _, plant, _):
         gripper.home()
@@ -117,9 +212,10 @@ def test_close_after_a_grasp_without_a_result_stops_the_fingers(monkeypatch: pyt
             raise PeerTimeout("no result")
 
         monkeypatch.setattr(link, "run", no_result)
-        monkeypatch.setattr(gripper, "_stop_after", lambda name, reason: None)
-        with pytest.raises(PeerTimeout):
-            gripper.grasp(width=0.010, speed=0.005, force=20)
+        with monkeypatch.context() as lost:
+            lost.setattr(gripper, "_stop_twice", lambda link: None)
+            with pytest.raises(PeerTimeout):
+                gripper.grasp(width=0.010, speed=0.005, force=20)
         eventually(lambda: gripper.state().grasp == "grasping", "the grasp did not start")
         gripper.close()
         assert record.names[-2:] == ["stop", "disconnect"]
