@@ -93,7 +93,9 @@ class CameraMount:
             ("visible_rows", self.visible_rows, self.rows),
             ("visible_cols", self.visible_cols, self.cols),
         ):
-            if lines is not None and not (lines[0] >= 1 and lines[0] + 2 <= lines[1] <= printed):
+            if lines is None:
+                continue
+            if len(lines) != 2 or not (lines[0] >= 1 and lines[0] + 2 <= lines[1] <= printed):
                 raise UsageError(
                     f"{name} must name the first and the last of at least 3 lines of 1 to {printed}, got {list(lines)}"
                 )
@@ -225,6 +227,8 @@ class ImageDecoder:
 
     def __call__(self, data: bytes, *, reduce: Reduction = 1) -> Image:
         """The image B G R, uint8, shape (height, width, 3); see `decode_image`."""
+        if reduce not in _DECODING:
+            raise UsageError(f"reduce must be 1, 2, 4 or 8, got {reduce!r}")
         if data.startswith(_JPEG):
             return np.asarray(_decoded(data, _DECODING[reduce]), dtype=np.uint8)
         image = _decoded(data, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)

@@ -174,7 +174,7 @@ class ImageSource:
 
 
 def image_source(
-    text: str, *, sensor: str = "left", rate: float = 25.0, profile: SensorProfile | None = None
+    text: str | Path, *, sensor: str = "left", rate: float = 25.0, profile: SensorProfile | None = None
 ) -> ImageSource:
     """The image source at `text`: the number of a camera, the URL of a stream, an .mcap session, a folder or a file.
 
@@ -184,6 +184,7 @@ def image_source(
     sensor, whose part of each image is used. Raises UsageError when the file or folder does not exist, or the folder
     contains no images.
     """
+    text = str(text)
     if not text:
         raise UsageError("expected a folder, a file, a URL or a camera number, got an empty text")
     if sensor not in SENSORS:

@@ -23,6 +23,7 @@ from gelflow.policies.training.state import (
     load_optimizer_tensors,
     optimizer_tensors,
 )
+from gelflow.ranges import COUNT, POSITIVE, SHARE_BELOW_1, check_settings
 from gelflow.sim.tasks.task_batch import TaskBatch
 
 
@@ -58,8 +59,7 @@ class BackpropagationSettings:
     window: int = 100  # steps through which a gradient passes; shorter windows miss late consequences of an action
 
     def __post_init__(self) -> None:
-        if self.window < 1 or not self.learning_rate > 0 or not self.gradient_norm > 0:
-            raise UsageError(f"back-propagation requires window, learning rate and gradient norm above 0, got {self}")
+        check_settings(self, learning_rate=POSITIVE, betas=(SHARE_BELOW_1, 2), gradient_norm=POSITIVE, window=COUNT)
 
 
 class Backpropagation(Learner):

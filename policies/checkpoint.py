@@ -29,6 +29,7 @@ FORMAT = 1
 MAX_BYTES = 2_000_000  # [bytes]
 _SHOWN = 8  # longest list of a setting that a message shows
 _HEADER_KEY = "gelflow"
+_HEADER_DIGEST = "header_sha256"  # missing in checkpoints of earlier versions
 _SHIPPED = Path(__file__).resolve().parent / "checkpoints"
 
 
@@ -77,6 +78,8 @@ def save_checkpoint(
         "tensors_sha256": _fingerprint(stored),
         "versions": {"gelflow": __version__, "python": platform.python_version(), "numpy": np.__version__},
     }
+    header = json.loads(json.dumps(header))  # as it is read
+    header[_HEADER_DIGEST] = _header_fingerprint(header)
     data = safetensors.numpy.save(stored, metadata={_HEADER_KEY: json.dumps(header, sort_keys=True)})
     if len(data) > MAX_BYTES:
         raise UsageError(
@@ -101,17 +104,23 @@ def replace_file(path: Path, data: bytes) -> None:
         raise
 
 
-def load_checkpoint(path: Path) -> Checkpoint:
+def load_checkpoint(path: str | Path) -> Checkpoint:
     """Reads a checkpoint.
 
     Raises UsageError when the file is missing, not a checkpoint, damaged, or has a newer format.
     """
+    path = Path(path)
     data = _read(path)
     header = _read_header(path, data)
     try:
+        stored = header.pop(_HEADER_DIGEST, None)
+        if stored is not None and stored != _header_fingerprint(header):
+            raise ValueError("checksum mismatch of the header")
         tensors = safetensors.numpy.load(data)
         if header["tensors_sha256"] != _fingerprint(tensors):
             raise ValueError("checksum mismatch of the tensors")
+        if types := {str(values.dtype) for values in tensors.values()} - {"float32"}:
+            raise ValueError(f"tensors of type {', '.join(sorted(types))}")
         return Checkpoint(
             task=dict(header["task"]),
             architecture=architecture_from_json(header["architecture"]),
@@ -140,7 +149,6 @@ def load_network(path: str | Path, *, task: TaskDescription) -> Network:
     Raises UsageError as `load_checkpoint` does, and when the checkpoint was trained for another task description; the
     message lists the fields that differ.
     """
-    path = Path(path)
     checkpoint = load_checkpoint(path)
     if different := task_differences(checkpoint.task, task.to_json()):
         raise UsageError(
@@ -210,6 +218,11 @@ def _read_header(path: Path, data: bytes) -> dict[str, Any]:
     if version > FORMAT:
         raise UsageError(f"{path} has format {version}; this gelflow reads format {FORMAT}: update gelflow")
     return dict(header)
+
+
+def _header_fingerprint(header: Mapping[str, Any]) -> str:
+    """SHA-256 of the header in its canonical form, without the field of the fingerprint."""
+    return hashlib.sha256(json.dumps(header, sort_keys=True).encode()).hexdigest()
 
 
 def _fingerprint(tensors: Mapping[str, NDArray[Any]]) -> str:

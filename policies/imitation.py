@@ -27,6 +27,7 @@ from gelflow.policies.networks.polynomial_gru import PolynomialGRU, PolynomialGR
 from gelflow.policies.networks.polynomial_gru_torch import TorchPolynomialGRU
 from gelflow.policies.training.learner import Learner
 from gelflow.policies.training.state import RunState, load_optimizer_tensors, optimizer_tensors
+from gelflow.ranges import COUNT, NOT_NEGATIVE, POSITIVE, SHARE, check_settings
 from gelflow.sim.tasks.task_batch import TaskBatch
 from gelflow.task import InsertionTask
 
@@ -63,8 +64,20 @@ class ImitationSettings:
     exploration: tuple[float, float] = (0.4, 0.03)
 
     def __post_init__(self) -> None:
-        if min(self.rollout, self.updates, self.batch, self.memory) < 1 or not self.learning_rate > 0:
-            raise UsageError(f"imitation requires counts and a learning rate above 0, got {self}")
+        check_settings(
+            self,
+            rollout=COUNT,
+            updates=COUNT,
+            batch=COUNT,
+            memory=COUNT,
+            learning_rate=POSITIVE,
+            gradient_norm=POSITIVE,
+            bounded=SHARE,
+            bounded_after=SHARE,
+            exploration=(NOT_NEGATIVE, 2),
+        )
+        if self.tolerance is not None:
+            check_settings(self, tolerance=(POSITIVE, 3))
 
 
 @dataclass(frozen=True)

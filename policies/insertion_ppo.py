@@ -5,7 +5,7 @@ It is immediate, so the discount is small, and its variance does not depend on t
 """
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium.spaces import Box
@@ -74,6 +74,12 @@ class HistoryTask(TaskBatch):
         return self._task.render(index)
 
 
+class UnclippedMLP(MLP):
+    """A perceptron whose normalization is linear, so that the first layer of a `PolynomialMLP` can contain it."""
+
+    clip: ClassVar[float] = np.inf
+
+
 class InsertionPPO(PPO):
     """PPO that trains a `PolynomialMLP` on the insertion."""
 
@@ -82,7 +88,8 @@ class InsertionPPO(PPO):
     ) -> None:
         """As `PPO`; `task` observes flow maps."""
         history = HistoryTask(task, architecture)
-        perceptron = MLP(observation_shape=history.observation_space.shape, actions=3, hidden=architecture.hidden)
+        shape = history.observation_space.shape
+        perceptron = UnclippedMLP(observation_shape=shape, actions=3, hidden=architecture.hidden)
         super().__init__(history, perceptron, settings, seed=seed, steps=steps)
         self.architecture = architecture
         self._hidden, self._fixed = architecture.hidden, fixed_tensors(architecture, task)

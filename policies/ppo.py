@@ -25,6 +25,7 @@ from gelflow.policies.training.state import (
     load_optimizer_tensors,
     optimizer_tensors,
 )
+from gelflow.ranges import COUNT, NOT_NEGATIVE, POSITIVE, SHARE, check_settings
 from gelflow.sim.tasks.task_batch import TaskBatch
 
 
@@ -47,8 +48,21 @@ class PPOSettings:
     privileged_critic: bool = False  # the critic observes `info["privileged"]`
 
     def __post_init__(self) -> None:
-        if min(self.rollout, self.batch, self.epochs) < 1 or min(self.learning_rate, self.deviation) <= 0:
-            raise UsageError(f"PPO requires a positive rollout, batch, epochs, learning rate and deviation, got {self}")
+        check_settings(
+            self,
+            rollout=COUNT,
+            batch=COUNT,
+            epochs=COUNT,
+            learning_rate=POSITIVE,
+            last_learning_rate=NOT_NEGATIVE,
+            discount=SHARE,
+            trace=SHARE,
+            clip=POSITIVE,
+            value=NOT_NEGATIVE,
+            entropy=NOT_NEGATIVE,
+            gradient_norm=POSITIVE,
+            deviation=POSITIVE,
+        )
 
 
 @dataclass
@@ -81,6 +95,7 @@ class PPO(Learner):
         """`steps` is the number of environment steps until the learning rate has decreased to its last value."""
         super().__init__(task, architecture)
         self._recurrent = architecture.recurrent > 0
+        _check_minibatches(task, settings, recurrent=self._recurrent)
         self._actions = architecture.actions
         torch.manual_seed(seed)  # initial weights
         self._settings, self._total = settings, steps
@@ -241,17 +256,22 @@ class PPO(Learner):
         return {"value_loss": float(np.mean(losses)), "clipped": float(np.mean(clipped))}
 
     def _minibatches(self, rollout: Rollout) -> list[Rollout]:
-        """Random parts of a rollout: single steps (1, batch, …), or whole sequences (T, n, …) if recurrent."""
+        """Random parts of a rollout: single steps (1, batch, …), or whole sequences (T, n, …) if recurrent.
+
+        A part of one step is left out: the advantages of a minibatch are relative to their mean.
+        """
         steps, envs = rollout.log_probs.shape
         size = self._settings.batch
         if self._recurrent:
-            order = torch.randperm(envs, generator=self._noise).split(max(1, size // steps))
+            order = torch.randperm(envs, generator=self._noise).split(_sequences(size, steps))
+            order = [i for i in order if steps * len(i) > 1]
             parts = [[value[:, i] for value in rollout.sequences()] for i in order]
             memories = [(rollout.actor_memory[i], rollout.critic_memory[i]) for i in order]
         else:
             order = torch.randperm(steps * envs, generator=self._noise).split(size)
+            order = [i for i in order if len(i) > 1]
             flat = [value.flatten(0, 1) for value in rollout.sequences()]
-            parts = [[value[None, i] for value in flat] for i in order if len(i) > 1]
+            parts = [[value[None, i] for value in flat] for i in order]
             memories = [(torch.zeros(0), torch.zeros(0))] * len(parts)
         return [Rollout(*part, *memory) for part, memory in zip(parts, memories, strict=True)]  # type: ignore[call-arg]
 
@@ -302,6 +322,21 @@ class PPO(Learner):
         self._return_moments = other["return_moments"].numpy().copy()
         self._rng = generator_from(state.values["rng"])
         self.steps = state.values["steps"]
+
+
+def _sequences(batch: int, steps: int) -> int:
+    """Number of sequences of `steps` steps in a minibatch of a recurrent actor."""
+    return max(1, batch // steps)
+
+
+def _check_minibatches(task: TaskBatch, s: PPOSettings, *, recurrent: bool) -> None:
+    """Raises UsageError when every minibatch has one step: its advantage relative to their mean is 0."""
+    largest = s.rollout * min(task.num_envs, _sequences(s.batch, s.rollout)) if recurrent else s.batch
+    if min(largest, s.rollout * task.num_envs) < 2:
+        raise UsageError(
+            f"PPO learns nothing from minibatches of one step: rollout {s.rollout}, batch {s.batch} and "
+            f"{task.num_envs} environments; increase them"
+        )
 
 
 def _advantages(rewards: Tensor, values: Tensor, next_values: Tensor, ends: Tensor, s: PPOSettings) -> Tensor:

@@ -103,9 +103,18 @@ def number_array(name: str, value: ArrayLike, dtype: Any) -> NDArray[Any]:
         raise UsageError(f"{name} must be numeric: {' '.join(str(error).split())}") from None
 
 
+def floating(values: Any) -> Any:
+    """An array or tensor; integers and flags as numbers in double precision."""
+    if isinstance(values, np.ndarray):
+        return values if np.issubdtype(values.dtype, np.floating) else values.astype(float)
+    return values if values.dtype.is_floating_point else values.double()
+
+
 def fill(name: str, target: NDArray[Any], value: ArrayLike) -> None:
     """Assign `value`, broadcast to the shape of `target`."""
     array = number_array(name, value, target.dtype)
+    if not target.flags.writeable:
+        raise UsageError(f"{name} must be writable")
     try:
         target[...] = array
     except ValueError:

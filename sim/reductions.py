@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gelflow.errors import UsageError
 from gelflow.sim import _core
-from gelflow.sim.arguments import check_type, number_array, shown
+from gelflow.sim.arguments import check_type, floating, number_array, shown
 
 if TYPE_CHECKING:  # loading a scene needs MuJoCo, which a simulator of a core model does not
     from gelflow.sim.scene.pads import PadDef
@@ -52,6 +52,7 @@ class TactileReduction:
         rows, markers, _ = self.matrix.shape
         if not (isinstance(forces, np.ndarray) or hasattr(forces, "requires_grad")):
             forces = number_array("forces", forces, float)
+        forces = floating(forces)
         if tuple(forces.shape[-2:]) != (markers, 3):
             raise UsageError(f"forces must have shape (…, {markers}, 3), got {tuple(forces.shape)}")
         flat = forces.reshape((*forces.shape[:-2], markers * 3))

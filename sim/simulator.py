@@ -301,7 +301,7 @@ class Simulator(StateArrays):
         reduction: record this function of the marker forces instead of the forces
         active: mask (N,); the others rest, cost nothing, and have readings of zero, or with `out` those in `out`
         stop: stops environments on touch
-        out: an earlier trajectory of the same shape whose arrays are overwritten, which saves their allocation
+        out: an earlier trajectory of the same shape whose arrays are overwritten, by a refused call too; saves time
 
         Raises UsageError for wrong shapes and for values that are not finite.
         """

@@ -101,7 +101,8 @@ def torch_rollout(
         _check_tensor(name, tensor, expected)
     _check_tensor("state.anchored", state.anchored, torch.uint8)
     numbers = None if params is None else _all_params(sim, params)
-    inputs = (u, state.q, state.v, state.anchors, state.history, numbers, state.anchored)
+    starts = (tensor.resolve_neg() for tensor in (u, state.q, state.v, state.anchors, state.history))
+    inputs = (*starts, numbers, state.anchored)
     options = {"read_after": read_after, "reduction": reduction, "active": active, "stop": stop}
     outputs = _Rollout.apply(*inputs, sim, options)  # type: ignore[no-untyped-call]
     q, v, tactile, anchors, history, anchored, ok, stopped_at = outputs

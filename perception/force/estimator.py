@@ -35,6 +35,21 @@ def check_force_grid(rows: int, cols: int) -> None:
         raise UsageError(f"forces need a grid of at least 3 × 3 and at most {MAX_MARKERS} markers, got {rows} × {cols}")
 
 
+def checked_displacement(
+    displacement: Array, valid: NDArray[np.bool_], markers: int
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Both as arrays. Raises UsageError for another shape, and for a valid displacement that is not finite."""
+    displacement, valid = np.asarray(displacement, float), np.asarray(valid, bool)
+    if displacement.shape != (markers, 2) or valid.shape != (markers,):
+        raise UsageError(
+            f"expected displacements of shape ({markers}, 2) and valid of shape ({markers},), got "
+            f"{displacement.shape} and {valid.shape}"
+        )
+    if not np.isfinite(displacement[valid]).all():
+        raise UsageError("a displacement of a valid marker is not finite")
+    return displacement, valid
+
+
 @dataclass(frozen=True)
 class ForceEstimate:
     """Forces of an object on the gel, in the axes of the displacements; the normal force is positive in compression.
@@ -100,15 +115,8 @@ class ForceEstimator:
 
         Raises UsageError for arrays of another shape, valid displacements that are not finite, and a missing stamp.
         """
-        displacement, valid = np.asarray(displacement, float), np.asarray(valid, bool)
         markers = len(self._positions)
-        if displacement.shape != (markers, 2) or valid.shape != (markers,):
-            raise UsageError(
-                f"expected displacements of shape ({markers}, 2) and valid of shape ({markers},), got "
-                f"{displacement.shape} and {valid.shape}"
-            )
-        if not np.isfinite(displacement[valid]).all():
-            raise UsageError("a displacement of a valid marker is not finite")
+        displacement, valid = checked_displacement(displacement, valid, markers)
         if self.gel.creep:
             if stamp is None or not math.isfinite(stamp):
                 raise UsageError("a gel with creep needs the time of each image: give stamp [s]")

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.observation import Grid
-from gelflow.perception.force.estimator import ForceEstimate
+from gelflow.perception.force.estimator import ForceEstimate, checked_displacement
 from gelflow.perception.force.partial_slip import PartialSlip
 
 Array = NDArray[np.float64]
@@ -102,7 +102,12 @@ class SlipEstimator:
         displacement: from rest [m], shape (markers, 2), along rows and columns of the grid; ignored where not valid
         valid: whether a marker is measured, shape (markers,)
         stamp: time of the image [s]; the contact counts as a new one where it does not increase
+
+        Raises UsageError for arrays of another shape, valid displacements that are not finite, and such a stamp.
         """
+        displacement, valid = checked_displacement(displacement, valid, len(self._positions))
+        if not math.isfinite(stamp):
+            raise UsageError(f"stamp must be finite, got {stamp}")
         weights = None if force is None else np.where(valid, force.normal_field, 0.0)
         if self._history and stamp <= self._history[-1].stamp:
             self._clear_contact()

@@ -51,7 +51,7 @@ class GridRequest:
             return ()
         if rows is None or cols is None:
             raise UsageError("give both rows and cols of the grid of markers, or neither")
-        if min(rows, cols) < 3 or max(rows, cols) > 200:
+        if not all(isinstance(lines, int | np.integer) and 3 <= lines <= 200 for lines in (rows, cols)):
             raise UsageError(f"a grid of markers has 3 to 200 rows and columns, got {rows} × {cols}")
         return ((rows, cols), (cols, rows)) if self.either_way and rows != cols else ((rows, cols),)
 

@@ -11,7 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
-from gelflow.policies.networks.base import Architecture, Array, BatchPolicy, Network, Tensors, check_tensors
+from gelflow.policies.networks.base import (
+    Architecture,
+    Array,
+    BatchPolicy,
+    Network,
+    Tensors,
+    check_mask,
+    check_observations,
+    check_tensors,
+)
 from gelflow.policies.networks.layers import gru_cell, linear
 from gelflow.task import TaskDescription
 
@@ -94,13 +103,12 @@ class ActorPolicy(BatchPolicy):
 
     def reset(self, which: NDArray[np.bool_]) -> None:
         """Clears the memory of the environments marked in `which`."""
+        check_mask(which, len(self._memory))
         self._memory[which] = 0
 
     def act(self, observations: NDArray[Any]) -> Array:
-        """Actions (n, k) in ±1. Raises UsageError for observations of another shape."""
-        shape = (len(self._memory), *self._network.architecture.observation_shape)
-        if observations.shape != shape:
-            raise UsageError(f"observations have shape {observations.shape}; the policy takes {shape}")
+        """Actions (n, k) in ±1. Raises UsageError for observations of another shape or that are not finite."""
+        check_observations(observations, (len(self._memory), *self._network.architecture.observation_shape))
         actions, self._memory = self._network.forward(observations, self._memory)
         return np.clip(actions, -1, 1)
 

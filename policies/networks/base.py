@@ -77,3 +77,19 @@ def check_tensors(tensors: Tensors, expected: Mapping[str, tuple[int, ...]]) -> 
             raise UsageError(f"tensor {name} has shape {tensors[name].shape}; expected {shape}")
         if not np.isfinite(tensors[name]).all():
             raise UsageError(f"tensor {name} has values that are not finite")
+
+
+def check_observations(observations: NDArray[Any], shape: tuple[int, ...]) -> None:
+    """Raises UsageError for observations of another shape, or with values that are not finite."""
+    if observations.shape != shape:
+        raise UsageError(f"observations have shape {observations.shape}; the policy takes {shape}")
+    if not np.isfinite(observations).all():
+        wrong = np.flatnonzero(~np.isfinite(observations.reshape(len(observations), -1)).all(1))
+        raise UsageError(f"observation {wrong[0]} has values that are not finite")
+
+
+def check_mask(which: NDArray[np.bool_], count: int) -> None:
+    """Raises UsageError unless `which` is a mask of `count` environments; integers would be indices."""
+    given = np.asarray(which)
+    if given.dtype != bool or given.shape != (count,):
+        raise UsageError(f"a mask of environments must be ({count},) bool, got {given.shape} {given.dtype}")

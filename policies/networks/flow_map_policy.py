@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from gelflow.errors import UsageError
 from gelflow.geometry import rotated
 from gelflow.observation import FlowMap
-from gelflow.policies.networks.base import Array, BatchPolicy, Network
+from gelflow.policies.networks.base import Array, BatchPolicy, Network, check_observations
 from gelflow.task import InsertionTask, TaskDescription
 
 
@@ -26,15 +26,19 @@ def in_frame_of_start(corrections: Array, displacement: Array) -> Array:
 class CorrectionPolicy(BatchPolicy):
     """A network that corrects the poses of several parts and remembers their attempts."""
 
-    def __init__(self, task: InsertionTask) -> None:
-        self._task = task
+    def __init__(self, task: InsertionTask, count: int) -> None:
+        self._task, self._count = task, count
 
     @abstractmethod
     def corrections(self, images: NDArray[Any]) -> Array:
         """Corrections (n, 3) [m, m, rad] in the gripper frame for the latest flow maps; deterministic."""
 
     def act(self, observations: NDArray[Any]) -> Array:
-        """Actions (n, 3) for the latest flow maps; ±1 is `InsertionTask.action_scale`."""
+        """Actions (n, 3) for the latest flow maps; ±1 is `InsertionTask.action_scale`.
+
+        Raises UsageError for flow maps of another shape or with values that are not finite.
+        """
+        check_observations(observations, (self._count, *self._task.observation_shape))
         return np.asarray(self.corrections(observations) / np.asarray(self._task.action_scale))
 
 

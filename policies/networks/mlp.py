@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     import torch
 
 VARIANCE_FLOOR = 1e-6  # keeps constant components small
-CLIP = 8.0  # largest normalized component
 
 
 @dataclass(frozen=True)
@@ -24,6 +23,7 @@ class MLP(ActorArchitecture):
     """Normalization and hidden layers with tanh."""
 
     kind: ClassVar[str] = "mlp"
+    clip: ClassVar[float] = 8.0  # largest normalized component
     hidden: tuple[int, ...] = (64, 64)
 
     def __post_init__(self) -> None:
@@ -47,7 +47,7 @@ class MLP(ActorArchitecture):
     def encode(self, observations: NDArray[Any], tensors: dict[str, Array]) -> Array:
         """Features (n, features) of observations (n, size)."""
         values = (observations - tensors["mean"]) / np.sqrt(tensors["variance"] + VARIANCE_FLOOR)
-        values = np.clip(values, -CLIP, CLIP)
+        values = np.clip(values, -self.clip, self.clip)
         for i in range(len(self.hidden)):
             values = np.tanh(linear(values, tensors[f"layers.{i}.weight"], tensors[f"layers.{i}.bias"]))
         return values
@@ -56,4 +56,5 @@ class MLP(ActorArchitecture):
         """The encoder for training."""
         from gelflow.policies.networks.torch_actor import VectorEncoder  # deferred: torch is slow to import
 
-        return VectorEncoder((self.observation_shape[0], *self.hidden), variance_floor=VARIANCE_FLOOR, clip=CLIP)
+        sizes = (self.observation_shape[0], *self.hidden)
+        return VectorEncoder(sizes, variance_floor=VARIANCE_FLOOR, clip=self.clip)

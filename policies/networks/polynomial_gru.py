@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
-from gelflow.policies.networks.base import Architecture, Array, Tensors, check_tensors
+from gelflow.policies.networks.base import Architecture, Array, Tensors, check_mask, check_tensors
 from gelflow.policies.networks.flow_map_policy import (
     CorrectionPolicy,
     FlowMapNetwork,
@@ -23,6 +23,7 @@ from gelflow.policies.networks.flow_map_policy import (
 from gelflow.policies.networks.layers import gru_cell, linear
 from gelflow.policies.networks.mirror_symmetry import reflections
 from gelflow.policies.networks.polynomial_features import num_features, reduce_maps
+from gelflow.ranges import COUNT, COUNT_FROM_0, POSITIVE, check_settings
 from gelflow.task import InsertionTask, TaskDescription
 
 _MOTION = 6  # inputs beside the features: the latest correction, and the displacement from the start
@@ -40,10 +41,7 @@ class PolynomialGRU(Architecture):
     mirror: tuple[str, ...] = ("x", "y")  # axes in which part and hole are symmetric: "x", "y", both or none
 
     def __post_init__(self) -> None:
-        if self.degree < 0 or self.units < 1 or self.head < 1:
-            raise UsageError(f"a network requires degree ≥ 0, units ≥ 1 and head ≥ 1, got {self}")
-        if len(self.reach) != 3 or min(self.reach) <= 0:
-            raise UsageError(f"reach must be three positive numbers, got {self.reach}")
+        check_settings(self, degree=COUNT_FROM_0, units=COUNT, head=COUNT, reach=(POSITIVE, 3))
         if not set(self.mirror) <= {"x", "y"}:
             raise UsageError(f"mirror may contain 'x' and 'y', got {self.mirror}")
 
@@ -127,7 +125,7 @@ class PolynomialGRUPolicy(CorrectionPolicy):
     """
 
     def __init__(self, network: PolynomialGRUNetwork, count: int) -> None:
-        super().__init__(network.task)
+        super().__init__(network.task, count)
         self.network = network
         self._reach = np.asarray(network.architecture.reach)
         self._state: Array = np.zeros((count, network.architecture.units))
@@ -143,6 +141,7 @@ class PolynomialGRUPolicy(CorrectionPolicy):
 
     def reset(self, which: NDArray[np.bool_]) -> None:
         """Clears the memory of the parts marked in `which`."""
+        check_mask(which, self._count)
         for array in (self._state, self._correction, self._displacement):
             array[which] = 0
         self.new[which] = True

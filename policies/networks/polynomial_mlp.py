@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
-from gelflow.policies.networks.base import Architecture, Tensors, check_tensors
+from gelflow.policies.networks.base import Architecture, Tensors, check_mask, check_tensors
 from gelflow.policies.networks.flow_map_policy import (
     CorrectionPolicy,
     FlowMapNetwork,
@@ -23,6 +23,7 @@ from gelflow.policies.networks.flow_map_policy import (
 from gelflow.policies.networks.layers import linear
 from gelflow.policies.networks.mirror_symmetry import MirrorSymmetry
 from gelflow.policies.networks.polynomial_features import num_features, reduce_maps
+from gelflow.ranges import COUNT, COUNT_FROM_0, POSITIVE, check_settings
 from gelflow.task import InsertionTask, TaskDescription
 
 Array = NDArray[np.float64]
@@ -41,10 +42,9 @@ class PolynomialMLP(Architecture):
     reach: tuple[float, float, float] = (8e-3, 8e-3, np.pi / 18)
 
     def __post_init__(self) -> None:
-        if self.degree < 0 or self.history < 1 or not self.hidden or min(self.hidden) < 1:
-            raise UsageError(f"a network requires degree ≥ 0, history ≥ 1 and hidden layers, got {self}")
-        if len(self.reach) != 3 or min(self.reach) <= 0:
-            raise UsageError(f"reach must be three positive numbers, got {self.reach}")
+        check_settings(self, degree=COUNT_FROM_0, history=COUNT, reach=(POSITIVE, 3))
+        if not self.hidden or min(self.hidden) < 1:
+            raise UsageError(f"a network requires hidden layers, got {self}")
 
     def features(self, task: InsertionTask) -> int:
         """Number of features of one flow map."""
@@ -172,12 +172,13 @@ class PolynomialPolicy(CorrectionPolicy):
     """A network with the history of `count` parts."""
 
     def __init__(self, network: PolynomialNetwork, count: int) -> None:
-        super().__init__(network.task)
+        super().__init__(network.task, count)
         self._network = network
         self._history = network.history(count)
 
     def reset(self, which: NDArray[np.bool_]) -> None:
         """Clears the history of the parts marked in `which`."""
+        check_mask(which, self._count)
         self._history.reset(which)
 
     def corrections(self, images: NDArray[Any]) -> Array:

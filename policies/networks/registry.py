@@ -16,6 +16,8 @@ _ARCHITECTURES = {architecture.kind: architecture for architecture in _KINDS}
 
 def architecture_from_json(data: Mapping[str, Any]) -> Architecture:
     """The architecture in the header of a checkpoint. Raises UsageError for an unknown kind and unknown keys."""
+    if not isinstance(data, Mapping):
+        raise UsageError(f"the architecture of the network must be a table, got {type(data).__name__}")
     kind = data.get("kind")
     if kind not in _ARCHITECTURES:
         raise UsageError(f"network is of kind {kind!r}; this gelflow supports {', '.join(sorted(_ARCHITECTURES))}")

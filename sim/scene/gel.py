@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.observation import Grid
+from gelflow.sim.arguments import floating
 from gelflow.toml_tables import TomlTable
 
 Array = NDArray[np.float64]
@@ -38,6 +39,7 @@ class SpringGel:
 
     def displacement(self, forces: Any) -> Any:
         """Displacements [m] under forces [N], arrays or tensors of shape (…, markers, 3)."""
+        forces = floating(forces)
         compliance = np.array([self.shear_compliance, self.shear_compliance, self.normal_compliance])
         return forces * _like(compliance, forces)
 
@@ -83,6 +85,7 @@ class LayerGel:
 
     def displacement(self, forces: Any) -> Any:
         """Displacements [m] under forces [N], arrays or tensors of shape (…, markers, 3)."""
+        forces = floating(forces)
         shape = tuple(forces.shape)
         matrix = self._single_precision_matrix if forces.dtype.itemsize == 4 else self.compliance_matrix
         return (forces.reshape(*shape[:-2], 3 * shape[-2]) @ _like(matrix, forces)).reshape(shape)

@@ -106,7 +106,7 @@ def _read_scene(path: Path, top: TomlTable, presets: Presets) -> Scene:
         path=path,
         step=top.number("step", mechanics.step if path.suffix in MODEL_SUFFIXES else None, minimum=1e-6),
         integrator=top.string("integrator", DEFAULT_INTEGRATOR, choices=INTEGRATORS),
-        tolerance=top.number("tolerance", DEFAULT_TOLERANCE, minimum=1e-15),
+        tolerance=top.number("tolerance", DEFAULT_TOLERANCE, minimum=1e-15, maximum=0.1),
         precision=cast("Precision", top.string("precision", "double", choices=PRECISIONS)),
         friction=friction,
         gravity=mechanics.gravity,

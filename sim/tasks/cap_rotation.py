@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
+from gelflow.ranges import NOT_NEGATIVE, POSITIVE, check_settings
 from gelflow.sim.drawing.scene_drawing import Polyline
 from gelflow.sim.reductions import TactileReduction, pad_forces, pad_pressures
 from gelflow.sim.scene import Scene
@@ -62,6 +63,9 @@ class CapRotationTask(ControlDescription):
         super().__post_init__()
         if self.reward not in REWARDS:
             raise UsageError(f"reward must be one of {', '.join(REWARDS)}, got {self.reward!r}")
+        units = ("length_unit", "pressure_unit", "force_unit", "command_unit")
+        check_settings(self, goal_angle=POSITIVE, **dict.fromkeys(units, POSITIVE))
+        check_settings(self, action_scale=NOT_NEGATIVE, contact_force=NOT_NEGATIVE)
 
     @property
     def observation_size(self) -> int:
@@ -168,14 +172,15 @@ class CapRotation(ControlTask):
     def _draw(self, which: Mask, rng: np.random.Generator, options: Mapping[str, Any]) -> None:
         check_options(self.description.name, options, _RESET_OPTIONS)
         sim, rows = self.sim, np.flatnonzero(which)
+        given = {
+            name: option_rows(name, value, which, (2,) if name == "center" else ()) for name, value in options.items()
+        }
         drawn = self.randomization.sample(rng, len(rows), friction=self.scene.friction)
-        self._sensors.draw(which, drawn, rng)
-        center = np.column_stack([drawn["center_x"], drawn["center_y"]])
-        center = option_rows("center", options["center"], which, (2,)) if "center" in options else center
-        radius = option_rows("radius", options["radius"], which) if "radius" in options else drawn["radius"]
-        damping = option_rows("damping", options["damping"], which) if "damping" in options else drawn["damping"]
+        center = given.get("center", np.column_stack([drawn["center_x"], drawn["center_y"]]))
+        radius, damping = given.get("radius", drawn["radius"]), given.get("damping", drawn["damping"])
         if (radius <= 0).any() or (damping < 0).any():
             raise UsageError("reset: radius must be above 0, and damping at least 0")
+        self._sensors.draw(which, drawn, rng)
         drawn |= {"center_x": center[:, 0], "center_y": center[:, 1], "radius": radius, "damping": damping}
         self._record(which, drawn, self.randomization)
         mass = self._density * np.pi * radius**2 * self._thickness

@@ -17,7 +17,8 @@ class DifferentiablePushing:
     task: the environments; their parameters and goals are those of the last `reset`, their state is not used
     observation: (N, size); differentiable
     errors: distance of the box to the goal [m] and of the yaw angles [rad] after the last step, (N, 2)
-    failed: (N,) bool, the simulation stopped in this episode; the gradient of a failed environment is zero
+    failed: (N,) bool, the simulation stopped in this episode; the environment then rests, with rewards of 0, and its
+        readings and its state after the failed period have no gradient
     """
 
     def __init__(self, task: Pushing) -> None:
@@ -39,10 +40,9 @@ class DifferentiablePushing:
     def step(self, actions: torch.Tensor) -> torch.Tensor:
         """One control period with actions (N, 3) in ±1; returns the rewards (N,)."""
         task, periods = self.task, self.task.steps_per_period
-        controls = task.controls(actions, self._steps)
-        result = torch_rollout(
-            task.sim, self._state, controls.expand(periods, -1, -1).contiguous(), read_after=(periods,)
-        )
+        controls = task.controls(actions, self._steps).expand(periods, -1, -1).contiguous()
+        active = ~self.failed
+        result = torch_rollout(task.sim, self._state, controls, read_after=(periods,), active=active)
         self._state = result.end
         self._steps += 1
         self.failed |= ~result.ok.numpy()
@@ -52,7 +52,7 @@ class DifferentiablePushing:
         squared, yaw = state.goal_error()
         self.errors = np.stack([squared.detach().numpy() ** 0.5, np.abs(yaw.detach().numpy())], axis=1)
         rewards: torch.Tensor = task.description.reward(state, actions)
-        return rewards
+        return torch.where(torch.from_numpy(active), rewards, 0.0)
 
     def _read(self, forces: torch.Tensor) -> torch.Tensor:
         """Readings of the pads; the deviations of real pads are constants for the gradient."""

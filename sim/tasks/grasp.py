@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.observation import MIN_DIVISORS, Grid, normalize
+from gelflow.ranges import POSITIVE, check_settings
 from gelflow.sim.scene import Scene, load_scene
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.tasks.gripper.attempt_task import AttemptTask
@@ -64,6 +65,8 @@ class GraspTask(TaskDescription):
             raise UsageError(f"sensors must be {len(PADS)} and attempts at least 1, got {given}")
         if min(times := (self.close_time, self.lift_time, self.hold_time)) < 0 or not self.lift_time > 0:
             raise UsageError(f"close_time, lift_time and hold_time must not be negative, lift_time not 0, got {times}")
+        if self.force_range is not None:
+            check_settings(self, force_range=(POSITIVE, 2))
         if self.force_range is not None and not 0 < self.force_range[0] < self.force_range[1] <= 20:
             raise UsageError(f"force_range must be 0 < low < high ≤ 20 N, got {self.force_range}")
 
@@ -205,8 +208,8 @@ class Grasp(AttemptTask):
         limit = self.bar.max_center_of_mass
         if (np.abs(drawn["center_of_mass"]) > limit + 1e-9).any() or (drawn["mass"] <= 0).any():
             raise UsageError(f"reset: center_of_mass must be within ±{limit:.4g} m, and mass positive")
-        self._record(which, drawn, self.randomization, center_of_mass="m", start="m")
         self._sensors.draw(which, drawn, rng)
+        self._record(which, drawn, self.randomization, center_of_mass="m", start="m")
         params = pad_parameters(drawn, elastic=self.scene.friction == "elastic")
         params |= self._draw_bar(which, drawn)
         for name, values in params.items():

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.observation import Grid
+from gelflow.ranges import NOT_NEGATIVE, POSITIVE, SHARE, check_ordered, check_settings
 from gelflow.sim.drawing.scene_drawing import Polyline
 from gelflow.sim.tasks.control_task import ControlDescription, ControlTask
 from gelflow.sim.tasks.randomization import Fixed, Quantity, Randomization
@@ -73,6 +74,12 @@ class PushingTask(ControlDescription):
             raise UsageError(f"observation must be one of {', '.join(OBSERVATIONS)}, got {self.observation!r}")
         if self.history < 1:
             raise UsageError(f"history must be at least 1, got {self.history}")
+        positive = ("force_period", "position_tolerance", "yaw_tolerance", "touch_distance")
+        units = ("goal_unit", "yaw_unit", "marker_unit", "box_unit", "mass_unit")
+        check_settings(self, **dict.fromkeys(positive + units, POSITIVE))
+        check_settings(self, **dict.fromkeys(("goal_yaw_spread", "start_offset", "force"), NOT_NEGATIVE))
+        check_settings(self, action_scale=(NOT_NEGATIVE, 3), no_force=SHARE)
+        check_ordered(self, "goal_x", "goal_y")
 
     @property
     def frame_size(self) -> int:
@@ -240,6 +247,10 @@ class Pushing(ControlTask):
     def _draw(self, which: Mask, rng: np.random.Generator, options: Mapping[str, Any]) -> None:
         task, rows = self.description, np.flatnonzero(which)
         check_options(task.name, options, _RESET_OPTIONS)
+        shapes = {"goal": (3,), "half_size": (2,)}
+        given = {name: option_rows(name, value, which, shapes.get(name, ())) for name, value in options.items()}
+        if any((given[name] <= 0).any() for name in ("half_size", "mass") if name in given):
+            raise UsageError("reset: half_size and mass must be above 0")
         drawn = self.randomization.sample(rng, len(rows), friction=self.scene.friction)
         self._sensors.draw(which, drawn, rng)
         self.sim.param("box_ground.mu")[rows] = drawn["ground_mu"]
@@ -250,11 +261,7 @@ class Pushing(ControlTask):
             "offset": rng.uniform(-task.start_offset, task.start_offset, len(rows)),
             "half_size": np.column_stack([drawn["half_size_x"], drawn["half_size_y"]]),
             "mass": drawn["mass"],
-        }
-        for name, given in options.items():
-            values[name] = option_rows(name, given, which, values[name].shape[1:])
-        if (values["half_size"] <= 0).any() or (values["mass"] <= 0).any():
-            raise UsageError("reset: half_size and mass must be above 0")
+        } | given
         drawn |= dict(zip(_START_UNITS, (*values["goal"].T, values["offset"]), strict=True))
         drawn |= dict(
             zip(("half_size_x", "half_size_y", "mass"), (*values["half_size"].T, values["mass"]), strict=True)

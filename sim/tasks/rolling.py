@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.observation import Grid
+from gelflow.ranges import POSITIVE, check_ordered, check_settings
 from gelflow.sim.drawing.scene_drawing import Polyline
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.tasks.control_task import ControlDescription, ControlTask
@@ -45,6 +46,12 @@ class RollingTask(ControlDescription):
     length_unit: float = 0.01
     speed_unit: float = 0.1
     marker_unit: float = 1e-3  # of marker forces [N]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        positive = ("tolerance", "rest_speed", "pad_half_size", "length_unit", "speed_unit", "marker_unit")
+        check_settings(self, **dict.fromkeys(positive, POSITIVE))
+        check_ordered(self, "goal_distance")
 
     @property
     def observation_size(self) -> int:
@@ -129,12 +136,13 @@ class Rolling(ControlTask):
     def _draw(self, which: Mask, rng: np.random.Generator, options: Mapping[str, Any]) -> None:
         task, rows = self.description, np.flatnonzero(which)
         check_options(task.name, options, {"goal": "x, y from the ball's start [m]"})
+        given = option_rows("goal", options["goal"], which, (2,)) if "goal" in options else None
         drawn = self.randomization.sample(rng, len(rows), friction=self.scene.friction)
         self._sensors.draw(which, drawn, rng)
         distance, angle = rng.uniform(*task.goal_distance, len(rows)), rng.uniform(-np.pi, np.pi, len(rows))
         goal = distance[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
-        if "goal" in options:
-            goal = option_rows("goal", options["goal"], which, (2,))
+        if given is not None:
+            goal = given
         start = {"goal_x": goal[:, 0], "goal_y": goal[:, 1]}
         self._record(which, drawn | start, self.randomization, goal_x="m", goal_y="m")
         self.sim.reset(which)

@@ -87,11 +87,14 @@ class SensorModel:
 
         `sampled` has the levels of all effects, (n,) each, and may have `PAIR_QUANTITIES` of two pads.
 
-        Raises UsageError for a negative level.
+        Raises UsageError for a negative or missing level, before anything is changed.
         """
-        for name, level in self._level.items():
+        for name in self._level:
+            if name not in sampled:
+                raise UsageError(f"randomization: the quantity {name!r} is missing")
             if (np.asarray(sampled[name]) < 0).any():
                 raise UsageError(f"randomization: {name} must not be negative, got {np.min(sampled[name]):g}")
+        for name, level in self._level.items():
             level[which] = sampled[name]
         count, pads, total = int(which.sum()), self.gain.shape[1], len(self._pad_of)
 

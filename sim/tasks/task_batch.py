@@ -99,13 +99,18 @@ class TaskBatch(ABC):
         """Start new episodes in the environments `which` (N,); the others keep their state and cost nothing.
 
         An episode that ends at once, because its first attempt succeeds or its simulation fails, is drawn again unless
-        `keep_ended` is set (an evaluation counts it) or `options` fix the start. Raises UsageError for unknown options,
-        SimulationError when every draw ends at once.
+        `keep_ended` is set (an evaluation counts it) or `options` fix the start. Raises UsageError for unknown options
+        and wrong values, which change nothing, SimulationError when every draw ends at once.
         """
         rows = self._mask(which)
         if not rows.any():
             return
-        self._reset(rows, rng, options or {})
+        before = rng.bit_generator.state
+        try:
+            self._reset(rows, rng, options or {})
+        except UsageError:
+            rng.bit_generator.state = before
+            raise
         self._started |= rows
         if options or keep_ended:
             return

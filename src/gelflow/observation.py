@@ -88,13 +88,15 @@ def normalize(shear: Any, reference: Any, *, min_divisor: float) -> tuple[Any, A
     ----------
     shear: any leading batch, then (frames, sensors, rows, cols, 2)
     reference: the frame at rest, same leading batch, (sensors, rows, cols, 2)
-    min_divisor: smallest divisor, in the unit of shear
+    min_divisor: smallest divisor, in the unit of shear, above 0
 
     Returns
     -------
     image (…, frames * sensors * 2, rows, cols) and divisor (…), by which the difference was divided: the larger of
     `min_divisor` and the longest vector over all frames, sensors and markers together. Differentiable in torch.
     """
+    if not min_divisor > 0:
+        raise UsageError(f"min_divisor must be above 0, got {min_divisor}")
     flow = shear - reference[..., None, :, :, :, :]
     frames, sensors, rows, cols = flow.shape[-5:-1]
     lead = tuple(flow.shape[:-5])

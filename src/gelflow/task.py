@@ -11,7 +11,7 @@ import json
 import math
 import numbers
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, Self, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ from gelflow.errors import UsageError
 from gelflow.geometry import compose_planar, rotated
 from gelflow.observation import Grid
 from gelflow.part import CUBOID, Part
+from gelflow.ranges import NOT_NEGATIVE, POSITIVE, check_settings
 
 _START_ABOVE_RIM = 0.5e-3  # [m] of the lower face at the start of an attempt
 _SUCCESS_BELOW_RIM = 0.3e-3  # [m]
@@ -46,7 +47,7 @@ class TaskDescription:
         """Raises UsageError for a value of another type than the default, and for a number that is not finite."""
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            if (expected := _expected(field.default, value)) is not None:
+            if (expected := _expected(field, value)) is not None:
                 raise UsageError(f"{field.name} must be {expected}, got {' '.join(repr(value).split())}")
 
     def to_json(self) -> dict[str, Any]:
@@ -75,11 +76,14 @@ class TaskDescription:
         return hashlib.sha256(json.dumps(self.to_json(), sort_keys=True).encode()).hexdigest()[:16]
 
 
-def _expected(default: Any, value: Any) -> str | None:
+def _expected(field: "dataclasses.Field[Any]", value: Any) -> str | None:
     """The type and range that a value should have and has not, by the default of its field; None if it has them."""
+    default = field.default
     if isinstance(default, tuple):
-        is_right = isinstance(value, tuple | list) and all(_is_finite(number) for number in value)
-        return None if is_right else "a tuple of finite numbers"
+        if not isinstance(value, tuple | list) or not all(_is_finite(number) for number in value):
+            return "a tuple of finite numbers"
+        any_count = get_args(field.type)[-1] is Ellipsis
+        return None if any_count or len(value) == len(default) else f"a tuple of {len(default)} numbers"
     if isinstance(default, bool) or not isinstance(default, int | float):
         return None if default is None or isinstance(value, type(default)) else f"a {type(default).__name__}"
     if isinstance(default, int):
@@ -124,6 +128,11 @@ class InsertionTask(TaskDescription):
         super().__post_init__()
         if self.observation not in OBSERVATIONS:
             raise UsageError(f"observation must be one of {', '.join(OBSERVATIONS)}, got {self.observation!r}")
+        vector = (NOT_NEGATIVE, 3)
+        check_settings(self, attempts=POSITIVE, descent=POSITIVE, start_height=POSITIVE)
+        check_settings(self, action_scale=vector, workspace=vector, misalignment=vector)
+        if not self.frame_depths or min(self.frame_depths) < 0:
+            raise UsageError(f"frame_depths must be at least one depth, none negative, got {self.frame_depths}")
 
     def to_json(self) -> dict[str, Any]:
         """As plain data, without cuboid and flow map, so that it is that of checkpoints of earlier versions."""

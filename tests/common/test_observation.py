@@ -2,7 +2,14 @@ import numpy as np
 import pytest
 
 from gelflow.errors import UsageError
-from gelflow.observation import Grid, TactileFrame, flow_map, interpolation_weights, resampling_weights
+from gelflow.observation import (
+    Grid,
+    TactileFrame,
+    flow_map,
+    interpolation_weights,
+    normalize,
+    resampling_weights,
+)
 
 GRID = Grid(5, 4, 1.5, (2.0, -1.0))
 
@@ -66,3 +73,10 @@ def test_a_valid_marker_that_is_not_finite_is_refused(value: float) -> None:
 def test_flags_that_are_not_bool_are_refused() -> None:
     with pytest.raises(UsageError, match="valid must be an array of bool"):
         frame(valid="uint8")
+
+
+@pytest.mark.parametrize("divisor", [0.0, -1.0, float("nan")])
+def test_a_divisor_must_be_above_zero(divisor: float) -> None:
+    shear = np.zeros((1, 1, 3, 3, 2))
+    with pytest.raises(UsageError, match="min_divisor must be above 0"):
+        normalize(shear, shear[0], min_divisor=divisor)

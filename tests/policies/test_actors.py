@@ -75,7 +75,16 @@ def test_impossible_settings_are_rejected(make: object, message: str) -> None:
         make()
 
 
-def test_observations_of_another_shape_are_rejected() -> None:
-    policy = ACTORS[0].network(INSERTION, trained(ACTORS[0]).tensors()).batch_policy(2)
+def test_impossible_observations_and_masks_are_refused_without_a_change_of_the_memory() -> None:
+    network = ACTORS[1].network(INSERTION, trained(ACTORS[1]).tensors())
+    policy, other = network.batch_policy(2), network.batch_policy(2)
+    observations = np.random.default_rng(0).normal(size=(2, 7))
+    assert (policy.act(observations) == other.act(observations)).all()
     with pytest.raises(UsageError, match=r"shape \(2, 6\); the policy takes \(2, 7\)"):
         policy.act(np.zeros((2, 6)))
+    with pytest.raises(UsageError, match="observation 1 has values that are not finite"):
+        policy.act(np.where(np.arange(2)[:, None] == 1, np.nan, observations))
+    for mask in (np.array([1, 0]), np.ones(3, dtype=bool)):
+        with pytest.raises(UsageError, match=r"a mask of environments must be \(2,\) bool, got"):
+            policy.reset(mask)
+    assert (policy.act(observations) == other.act(observations)).all()

@@ -100,8 +100,6 @@ def test_gradient_of_an_episode_is_that_of_its_return() -> None:
     assert gradient == pytest.approx(-(returns[0] - returns[1]) / 2e-3 / 6, rel=2e-2)
 
 
-def test_settings_and_shapes_are_checked() -> None:
-    with pytest.raises(UsageError, match="requires window, learning rate and gradient norm above 0"):
-        BackpropagationSettings(window=0)
+def test_observations_of_another_shape_are_refused() -> None:
     with pytest.raises(UsageError, match=r"the task observes \(1,\); the network takes \(2,\)"):
         Backpropagation(Point(2), MLP((2,), 1), BackpropagationSettings(), seed=0, steps=1)

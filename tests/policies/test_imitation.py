@@ -263,9 +263,3 @@ def test_the_first_update_of_a_fine_tuning_has_the_bounded_loss() -> None:
 
     bounded, unbounded = first_update(0.9), first_update(0.0)
     assert any((bounded[name] != unbounded[name]).any() for name in bounded)
-
-
-def test_impossible_settings_are_rejected() -> None:
-    for changes in ({"updates": 0}, {"memory": 0}, {"learning_rate": 0.0}):
-        with pytest.raises(UsageError, match="above 0"):
-            ImitationSettings(**changes)

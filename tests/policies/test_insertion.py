@@ -1,7 +1,6 @@
 """Training, checkpoints and use of the insertion policy, on an analytic environment that replaces the simulator."""
 
 import dataclasses
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import pytest
 import safetensors.numpy
 import torch
 from numpy.typing import NDArray
+from tests.policies.checkpoint_files import rewrite
 from tests.policies.toy_insertion import ToyInsertion, images, mirrored
 
 from gelflow.errors import UsageError
@@ -20,7 +20,7 @@ from gelflow.policies.episodes import RandomPolicy, evaluate_task
 from gelflow.policies.insertion_ppo import HistoryTask, InsertionPPO
 from gelflow.policies.networks.polynomial_features import polynomial_basis, reduce_maps
 from gelflow.policies.networks.polynomial_mlp import History, PolynomialMLP, PolynomialNetwork
-from gelflow.policies.ppo import PPOSettings
+from gelflow.policies.ppo import PPO, PPOSettings
 from gelflow.policies.training.progress_log import read_table
 from gelflow.policies.training.run import STATE, Progress, RunSettings, TrainingRun
 from gelflow.policies.training.state import load_state
@@ -102,15 +102,6 @@ def test_a_checkpoint_of_another_task_is_rejected_with_the_differing_fields(stor
         load_policy(stored, task=dataclasses.replace(INSERTION, observation="forces"))
 
 
-def rewrite(path: Path, change: Callable[[dict[str, Any]], None]) -> None:
-    """Rewrites a checkpoint with a changed header."""
-    data = path.read_bytes()
-    length = int.from_bytes(data[:8], "little")
-    header = json.loads(json.loads(data[8 : 8 + length])["__metadata__"]["gelflow"])
-    change(header)
-    path.write_bytes(safetensors.numpy.save(safetensors.numpy.load(data), metadata={"gelflow": json.dumps(header)}))
-
-
 def test_a_newer_format_is_rejected(stored: Path) -> None:
     rewrite(stored, lambda header: header.update(format=2))
     with pytest.raises(UsageError, match="has format 2; this gelflow reads format 1"):
@@ -148,7 +139,7 @@ def test_truncated_and_corrupted_files_give_a_message_of_one_line(stored: Path, 
                 load_policy(damaged)
             except UsageError as error:
                 assert "\n" not in str(error)
-            else:  # a flipped byte in the text of the header, which does not affect the network
+            else:  # a flipped byte in the name of the header's checksum, see test_checkpoint.py
                 assert position < header and len(bad) == len(data)
 
 
@@ -310,11 +301,16 @@ def test_a_killed_training_continues_to_the_result_of_an_uninterrupted_one(tmp_p
     assert rewards[0] == rewards[1]
 
 
-def test_the_exported_perceptron_acts_as_the_trained_one() -> None:
+@pytest.mark.parametrize("deviations", [0, 30])
+def test_the_exported_perceptron_acts_as_the_trained_one(deviations: int) -> None:
     learner = InsertionPPO(ToyInsertion(32), SMALL, SETTINGS, seed=0, steps=4096)
     for _ in range(2):
         learner.update()
     observed = learner.task.observation.astype(float)
+    if deviations:  # a flag that is seldom true is far from its mean
+        flag = SMALL.history * SMALL.features(INSERTION) + (SMALL.history - 1) * 3
+        mean, variance = (PPO.tensors(learner)[f"encoder.{name}"][flag] for name in ("mean", "variance"))
+        observed[:, flag] = mean + deviations * np.sqrt(variance)
     with torch.no_grad():
         expected = learner._actor(torch.from_numpy(observed).float(), torch.zeros(32, 0))[0].clamp(-1, 1).numpy()
     network = SMALL.network(INSERTION, learner.tensors())

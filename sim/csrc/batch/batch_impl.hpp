@@ -240,6 +240,7 @@ void Batch<T>::wrenches(T* out) {
     contact_wrenches<T>(*model, params_of(e), state(e).anchors, state(e).anchored, memory_[thread].work,
                         out + static_cast<std::size_t>(e) * model->contacts.size() * 6);
   });
+  check_finite(out, "result of wrenches: w", n, static_cast<int>(model->contacts.size()) * 6, nullptr);
 }
 
 // Without the arc correction, which belongs to a step.
@@ -258,6 +259,7 @@ void Batch<T>::contact_forces(T* out) {
     }
     for (int k = 0; k < model->nv; ++k) out[static_cast<std::size_t>(e) * model->nv + k] = -w.residual[k];
   });
+  check_finite(out, "result of contact_forces: f", n, model->nv, nullptr);
 }
 
 template <class T>
@@ -282,6 +284,7 @@ void Batch<T>::mass_matrix(T* out) {
   check_all(nullptr);
   Workspace<T>& w = memory_[0].work;
   const std::size_t size = static_cast<std::size_t>(model->nv) * model->nv;
+  T* const first = out;
   for (int e = 0; e < n; ++e, out += size) {
     kinematics(e, w);
     w.residual.setZero();
@@ -301,18 +304,20 @@ void Batch<T>::mass_matrix(T* out) {
       w.layout.for_dofs(w.layout.island_of(i), [&](int j) { row[j] = w.mass(i, j); });
     }
   }
+  check_finite(first, "result of mass_matrix: m", n, static_cast<int>(size), nullptr);
 }
 
 template <class T>
 void Batch<T>::bias(T* out) {
   check_all(nullptr);
   Workspace<T>& w = memory_[0].work;
-  for (int e = 0; e < n; ++e, out += model->nv) {
+  for (int e = 0; e < n; ++e) {
     kinematics(e, w);
     w.residual.setZero();
     add_inverse_dynamics<false, T>(*model, params_of(e), T(1), state(e).v, nullptr, w);
-    std::copy_n(w.residual.data(), model->nv, out);
+    std::copy_n(w.residual.data(), model->nv, out + static_cast<std::size_t>(e) * model->nv);
   }
+  check_finite(out, "result of bias: c", n, model->nv, nullptr);
 }
 
 }  // namespace gelflow

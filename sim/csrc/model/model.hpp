@@ -191,6 +191,9 @@ struct Actuator {
   ParamBlock<ActuatorParams> params;
 };
 
+// Larger ones accept steps that ignore the acting forces.
+constexpr double largest_tolerance = 0.1;
+
 // Settings of the integrator and of Newton's method.
 struct SolverOptions {
   double step = 5e-3;       // h [s]

@@ -377,7 +377,9 @@ int ModelSpec::add_actuator(const ActuatorDef& def) {
 Model ModelSpec::build() const {
   if (model_.nv == 0) reject("the scene has no joint: nothing can move");
   if (!(options.step > 0) || !std::isfinite(options.step)) reject("step must be positive and finite");
-  if (!(options.tolerance > 0)) reject("tolerance must be positive");
+  if (!(options.tolerance > 0 && options.tolerance <= largest_tolerance)) {
+    reject("tolerance must be above 0 and at most 0.1");
+  }
   if (integrator != "bdf1" && integrator != "bdf2") reject("integrator '" + integrator + "' is not bdf1 or bdf2");
   ModelSpec complete = *this;  // a spec may be built again after changes
   complete.model_.gravity = complete.add_params("scene", "gravity", GravityParams<double>{gravity});

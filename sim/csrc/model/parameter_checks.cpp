@@ -67,6 +67,30 @@ std::string message(const std::string& name, const char* required, T got) {
   return text.str();
 }
 
+template <class T>
+std::string wrong_actuator(const Model& model, const T* params) {
+  for (const Actuator& actuator : model.actuators) {
+    const auto p = actuator.params.in(params);
+    if (p.force_lower > p.force_upper)
+      return message(actuator.name + ".force_lower", "be at most the upper limit", p.force_lower);
+    if (p.ctrl_lower > p.ctrl_upper)
+      return message(actuator.name + ".ctrl_lower", "be at most the upper limit", p.ctrl_lower);
+  }
+  return {};
+}
+
+template <class T>
+std::string wrong_rounding(const Model& model, const T* params) {
+  for (const Shape& shape : model.shapes) {
+    const bool box = shape.kind == ShapeKind::rounded_box;
+    if (!box && shape.kind != ShapeKind::rounded_cylinder) continue;
+    const T rounding = params[shape.size.offset + SizeParams<T>::names.size()];
+    const T smallest = shape.size.in(params).size.head(box ? 3 : 2).minCoeff();
+    if (rounding >= smallest) return message(shape.name + ".rounding", "be below the smallest half size", rounding);
+  }
+  return {};
+}
+
 // Of joints or tendons.
 template <class Elements, class T>
 std::string wrong_limits(const Elements& elements, const T* params) {
@@ -107,6 +131,8 @@ std::string wrong_parameter(const Model& model, const T* params) {
   }
   std::string wrong = wrong_limits(model.joints, params);
   if (wrong.empty()) wrong = wrong_limits(model.tendons, params);
+  if (wrong.empty()) wrong = wrong_actuator(model, params);
+  if (wrong.empty()) wrong = wrong_rounding(model, params);
   if (!wrong.empty()) return wrong;
   for (const Body& body : model.bodies) {
     const M3<double> before = body.params.in(model.param_defaults.data()).inertia();

@@ -46,6 +46,7 @@ const T* readable(const py::array& array, const Dimensions& shape, const char* n
 template <class T>
 T* writable(py::array& array, const Dimensions& shape, const char* name) {
   readable<T>(array, shape, name);
+  if (!array.writeable()) throw std::invalid_argument(std::string(name) + " must be writable");
   return static_cast<T*>(array.mutable_data());
 }
 

@@ -81,8 +81,14 @@ Dimensions reading_shape(const Trajectory<T>& r, const Model& m) {
   return {r.reads, r.environments, m.num_markers, 3};
 }
 
+// The memory of an array of a trajectory, which only a rollout writes.
 template <class T>
-Trajectory<T> checked(const Batch<T>& b, TrajectoryArrays& t) {
+T* memory_of(py::array& array, const Dimensions& shape, const char* name, bool written) {
+  return written ? writable<T>(array, shape, name) : const_cast<T*>(readable<T>(array, shape, name));
+}
+
+template <class T>
+Trajectory<T> checked(const Batch<T>& b, TrajectoryArrays& t, bool written) {
   if (t.u.ndim() != 3) throw std::invalid_argument("u must have shape (steps, environments, actuators)");
   const Model& m = *b.model;
   const py::ssize_t steps = t.u.shape(0), n = b.n, reads = t.read_after.size();
@@ -97,19 +103,19 @@ Trajectory<T> checked(const Batch<T>& b, TrajectoryArrays& t) {
   r.reads = static_cast<int>(reads);
   r.environments = b.n;
   r.u = readable<T>(t.u, {steps, n, actuators(b)}, "u");
-  r.q = writable<T>(t.q, {steps + 1, n, m.nq}, "q");
-  r.v = writable<T>(t.v, {steps + 1, n, m.nv}, "v");
-  r.anchors = writable<T>(t.anchors, {steps + 1, n, m.na, 3}, "anchors");
-  r.anchored = writable<std::uint8_t>(t.anchored, {steps + 1, n, m.na}, "anchored");
-  r.history = writable<T>(t.history, {steps + 1, n, m.nh}, "history");
-  r.halvings = writable<std::int8_t>(t.halvings, {steps, n}, "halvings");
-  r.status = writable<std::int32_t>(t.status, {n}, "status");
+  r.q = memory_of<T>(t.q, {steps + 1, n, m.nq}, "q", written);
+  r.v = memory_of<T>(t.v, {steps + 1, n, m.nv}, "v", written);
+  r.anchors = memory_of<T>(t.anchors, {steps + 1, n, m.na, 3}, "anchors", written);
+  r.anchored = memory_of<std::uint8_t>(t.anchored, {steps + 1, n, m.na}, "anchored", written);
+  r.history = memory_of<T>(t.history, {steps + 1, n, m.nh}, "history", written);
+  r.halvings = memory_of<std::int8_t>(t.halvings, {steps, n}, "halvings", written);
+  r.status = memory_of<std::int32_t>(t.status, {n}, "status", written);
   r.active = readable<std::uint8_t>(t.active, {n}, "active");
-  r.stopped_at = writable<std::int32_t>(t.stopped_at, {n}, "stopped_at");
+  r.stopped_at = memory_of<std::int32_t>(t.stopped_at, {n}, "stopped_at", written);
   r.read_after = read_after;
   r.reduction = t.reduction.get();
   if (r.reduction != nullptr) check_markers(m, *r.reduction);
-  r.tactile = writable<T>(t.tactile, reading_shape(r, m), "tactile");
+  r.tactile = memory_of<T>(t.tactile, reading_shape(r, m), "tactile", written);
   return r;
 }
 
@@ -219,7 +225,7 @@ void bind_reading_options(py::module_& module) {
 
 template <class T>
 GradientArrays rollout_vjp(Batch<T>& b, TrajectoryArrays& trajectory, const CotangentArrays& cotangent, bool params) {
-  const Trajectory<T> r = checked<T>(b, trajectory);
+  const Trajectory<T> r = checked<T>(b, trajectory, false);
   const TrajectoryCotangent<T> c = checked<T>(b, r, cotangent);
   const Model& m = *b.model;
   const py::ssize_t n = b.n, np = params ? static_cast<py::ssize_t>(m.param_names.size()) : 0;
@@ -300,7 +306,7 @@ void bind_steps(py::class_<Batch<T>>& type) {
       .def(
           "rollout",
           [](B& b, TrajectoryArrays& trajectory, const std::optional<TouchStopArrays>& stop) {
-            const Trajectory<T> r = checked<T>(b, trajectory);
+            const Trajectory<T> r = checked<T>(b, trajectory, true);
             const std::optional<TouchStop> touch =
                 stop ? std::optional<TouchStop>(checked(*stop, b.n, r.steps)) : std::nullopt;
             call(b, [&] { b.rollout(r, touch ? &*touch : nullptr); });
@@ -309,7 +315,7 @@ void bind_steps(py::class_<Batch<T>>& type) {
       .def(
           "contact_modes",
           [](B& b, TrajectoryArrays& trajectory) {
-            const Trajectory<T> r = checked<T>(b, trajectory);
+            const Trajectory<T> r = checked<T>(b, trajectory, false);
             py::array_t<std::uint64_t> out(Dimensions{r.steps, b.n});
             std::uint64_t* const signatures = out.mutable_data();
             call(b, [&] { b.contact_modes(r, signatures); });

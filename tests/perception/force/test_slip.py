@@ -154,3 +154,20 @@ def test_slip_from_rendered_images() -> None:
 def test_wrong_friction_is_refused(friction: float, deviation: float) -> None:
     with pytest.raises(UsageError, match="friction"):
         SlipEstimator(GRID, friction=friction, friction_deviation=deviation)
+
+
+def test_images_that_no_tracker_measures_are_refused() -> None:
+    slips, rest = SlipEstimator(GRID), np.zeros((130, 2))
+    force = ForceEstimator(GEL, GRID).estimate(rest, VALID)
+    broken = rest.copy()
+    broken[7, 1] = np.nan
+    for displacement, valid, stamp, message in (
+        (broken, VALID, 0.0, "a displacement of a valid marker is not finite"),
+        (rest[:100], VALID, 0.0, r"expected displacements of shape \(130, 2\)"),
+        (rest, VALID, np.nan, "stamp must be finite"),
+    ):
+        with pytest.raises(UsageError, match=message):
+            slips.estimate(force, displacement, valid, stamp)
+    broken_but_not_valid = VALID.copy()
+    broken_but_not_valid[7] = False
+    assert slips.estimate(force, broken, broken_but_not_valid, 0.0) is not None

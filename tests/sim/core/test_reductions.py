@@ -5,12 +5,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.sim import reductions
 from gelflow.sim.reductions import TactileReduction
 from gelflow.sim.scene import Scene, load_scene
+from gelflow.sim.scene.gel import SpringGel
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.validation.reference_motions import reference_motion
 
@@ -138,6 +140,15 @@ def test_nested_lists_are_a_matrix() -> None:
     reduction = TactileReduction([[[1, 0, 0], [2, 0, 0]]], ["sum"])  # type: ignore[arg-type]
     assert reduction.names == ("sum",)
     assert reduction([[3, 0, 0], [4, 0, 0]]).tolist() == [11.0]
+
+
+def test_integers_are_numbers() -> None:
+    ones = np.ones((2, 3, 3), dtype=np.int64)
+    mean = TactileReduction(np.full((1, 3, 3), 1 / 9), ("mean",))
+    assert mean(ones).ravel() == pytest.approx([1.0, 1.0])
+    assert mean(torch.from_numpy(ones)).ravel().tolist() == pytest.approx([1.0, 1.0])
+    gel = SpringGel(shear_compliance=0.01, normal_compliance=0.02)
+    np.testing.assert_allclose(gel.displacement(torch.from_numpy(ones))[0, 0].numpy(), [0.01, 0.01, 0.02])
 
 
 def test_invalid_reductions_raise() -> None:

@@ -310,3 +310,47 @@ def test_two_elements_of_one_kind_and_name_are_refused() -> None:
     spec.add_shape(_core.ShapeDef(name="floor", kind="plane"))
     with pytest.raises(ValueError, match="the name 'floor' is used twice"):
         spec.add_shape(_core.ShapeDef(name="floor", kind="plane"))
+
+
+def test_parameters_that_a_scene_file_cannot_have_are_refused() -> None:
+    sim = Simulator(load_scene("pushing"), num_envs=2)
+    sim.param("gripper_x.force_lower")[1] = 1.0
+    sim.param("gripper_x.force_upper")[1] = -1.0
+    with pytest.raises(UsageError, match=r"environment 1: parameter 'gripper_x.force_lower' must be at most the upper"):
+        sim.step(np.zeros(sim.model.nu))
+
+
+def test_a_rounding_as_large_as_the_shape_is_refused() -> None:
+    scene = load_scene("pushing")
+    shapes = tuple(replace(shape, rounding=0.004) if shape.name == "box" else shape for shape in scene.shapes)
+    sim = Simulator(replace(scene, shapes=shapes))
+    sim.step(np.zeros(sim.model.nu))
+    sim.param("box.rounding")[:] = 0.025
+    with pytest.raises(UsageError, match=r"parameter 'box.rounding' must be below the smallest half size, got 0.025"):
+        sim.step(np.zeros(sim.model.nu))
+    sim.param("box.rounding")[:] = 0.004
+    sim.param("box.size.x")[:] = 0.003
+    with pytest.raises(UsageError, match=r"parameter 'box.rounding' must be below the smallest half size, got 0.004"):
+        sim.step(np.zeros(sim.model.nu))
+
+
+def test_results_that_are_not_finite_are_refused() -> None:
+    sim = Simulator(load_scene("pushing"), num_envs=2, precision="single")
+    sim.v[1] = 1e30
+    with pytest.raises(UsageError, match=r"result of bias: c\[1, \d+\] is not finite"):
+        sim.bias()
+
+
+def test_read_only_trajectories_are_differentiated() -> None:
+    """As they arrive from shared memory."""
+    sim = Simulator(load_scene("pushing"), num_envs=2)
+    trajectory = sim.rollout(U)
+    expected = sim.rollout_gradient(trajectory, q=np.ones_like(trajectory.q))
+    arrays = ("u", "q", "v", "anchors", "anchored", "history", "tactile", "halvings", "status", "stopped_at")
+    for name in arrays:
+        getattr(trajectory, name).flags.writeable = False
+    gradient = sim.rollout_gradient(trajectory, q=np.ones_like(trajectory.q))
+    assert np.array_equal(gradient.u, expected.u)
+    sim.contact_modes(trajectory)
+    with pytest.raises(UsageError, match="q must be writable"):
+        sim.rollout(U, out=trajectory)

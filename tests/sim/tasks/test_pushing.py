@@ -162,6 +162,32 @@ def test_differentiable_episode_equals_that_of_the_batch() -> None:
         np.testing.assert_allclose(env.errors[:, 0], batch.info["position_error"], rtol=1e-12, err_msg=str(step))
 
 
+def test_a_failed_environment_rests_with_rewards_and_gradients_of_zero() -> None:
+    env = DifferentiablePushing(Pushing(2, threads=1))
+    action = torch.tensor([[0.9, 0.1, 0.0], [0.9, 0.1, 0.0]], dtype=torch.float64)
+    env.step(action)
+    env.failed[0] = True
+    rests = env._state.q[0].clone()
+    actions = action.clone().requires_grad_()
+    rewards = env.step(actions) + env.step(actions)
+    gradient = torch.autograd.grad(rewards.sum(), actions)[0]
+    assert rewards[0] == 0 and rewards[1] != 0 and not gradient[0].any() and gradient[1].any()
+    assert torch.equal(env._state.q[0], rests) and env.failed.tolist() == [True, False]
+
+
+@pytest.mark.parametrize("options", [{"mass": -1.0}, {"half_size": (0.02, 0.0)}, {"goal": (0.1, 0.2)}, {"size": 1.0}])
+def test_a_refused_reset_changes_nothing(options: dict[str, object]) -> None:
+    batch, rng = Pushing(4, randomization=FULL_RANDOMIZATION, threads=1), np.random.default_rng(0)
+    batch.reset(batch.all, rng)
+    before = {name: values.copy() for name, values in batch.quantities.items()}
+    params, gain, state = batch.sim.params.copy(), batch._sensors.gain.copy(), rng.bit_generator.state
+    with pytest.raises(UsageError, match="reset"):
+        batch.reset(batch.all, rng, options=options)
+    assert all(np.array_equal(batch.quantities[name], values) for name, values in before.items())
+    assert np.array_equal(batch.sim.params, params) and np.array_equal(batch._sensors.gain, gain)
+    assert rng.bit_generator.state == state
+
+
 def test_detached_steps_have_no_gradient_to_earlier_actions() -> None:
     env = DifferentiablePushing(Pushing(1, threads=1))
     first = torch.tensor([[0.9, 0.0, 0.0]], dtype=torch.float64, requires_grad=True)
