@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from gelflow.errors import UsageError
 from gelflow.policies.networks.actor import ActorArchitecture
 from gelflow.policies.networks.torch_actor import TorchActor
+from gelflow.policies.ranges import COUNT, POSITIVE, SHARE_BELOW_1, check_settings
 from gelflow.policies.training.learner import Learner
 from gelflow.policies.training.state import (
     RunState,
@@ -23,7 +24,6 @@ from gelflow.policies.training.state import (
     load_optimizer_tensors,
     optimizer_tensors,
 )
-from gelflow.ranges import COUNT, POSITIVE, SHARE_BELOW_1, check_settings
 from gelflow.sim.tasks.task_batch import TaskBatch
 
 

@@ -25,9 +25,9 @@ from gelflow.policies.networks.flow_map_policy import insertion_task
 from gelflow.policies.networks.polynomial_features import polynomial_basis, reduce_maps
 from gelflow.policies.networks.polynomial_gru import PolynomialGRU, PolynomialGRUNetwork
 from gelflow.policies.networks.polynomial_gru_torch import TorchPolynomialGRU
+from gelflow.policies.ranges import COUNT, NOT_NEGATIVE, POSITIVE, SHARE, check_settings
 from gelflow.policies.training.learner import Learner
 from gelflow.policies.training.state import RunState, load_optimizer_tensors, optimizer_tensors
-from gelflow.ranges import COUNT, NOT_NEGATIVE, POSITIVE, SHARE, check_settings
 from gelflow.sim.tasks.task_batch import TaskBatch
 from gelflow.task import InsertionTask
 

@@ -17,6 +17,7 @@ from gelflow.errors import UsageError
 from gelflow.policies.networks.actor import ActorArchitecture
 from gelflow.policies.networks.mlp import MLP
 from gelflow.policies.networks.torch_actor import TorchActor, VectorEncoder
+from gelflow.policies.ranges import COUNT, NOT_NEGATIVE, POSITIVE, SHARE, check_settings
 from gelflow.policies.training.learner import Learner
 from gelflow.policies.training.state import (
     RunState,
@@ -25,7 +26,6 @@ from gelflow.policies.training.state import (
     load_optimizer_tensors,
     optimizer_tensors,
 )
-from gelflow.ranges import COUNT, NOT_NEGATIVE, POSITIVE, SHARE, check_settings
 from gelflow.sim.tasks.task_batch import TaskBatch
 
 
@@ -258,7 +258,7 @@ class PPO(Learner):
     def _minibatches(self, rollout: Rollout) -> list[Rollout]:
         """Random parts of a rollout: single steps (1, batch, …), or whole sequences (T, n, …) if recurrent.
 
-        A part of one step is left out: the advantages of a minibatch are relative to their mean.
+        A part of one step is omitted: the advantages of a minibatch are relative to their mean.
         """
         steps, envs = rollout.log_probs.shape
         size = self._settings.batch

@@ -23,7 +23,7 @@ from gelflow.policies.networks.flow_map_policy import (
 from gelflow.policies.networks.layers import gru_cell, linear
 from gelflow.policies.networks.mirror_symmetry import reflections
 from gelflow.policies.networks.polynomial_features import num_features, reduce_maps
-from gelflow.ranges import COUNT, COUNT_FROM_0, POSITIVE, check_settings
+from gelflow.policies.ranges import COUNT, COUNT_FROM_0, POSITIVE, check_settings
 from gelflow.task import InsertionTask, TaskDescription
 
 _MOTION = 6  # inputs beside the features: the latest correction, and the displacement from the start

@@ -139,5 +139,5 @@ MOTIONS = (Command.HOME, Command.PRE_POSITION, Command.GRASP, Command.RELEASE)
 
 
 def meaning(status: Status) -> str:
-    """What the status of a refused or failed motion means, for errors."""
+    """Explanation of the status of a refused or failed motion, for errors."""
     return _MEANINGS.get(status, "see the device's manual")

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
-from gelflow.ranges import NOT_NEGATIVE, POSITIVE, check_settings
 from gelflow.sim.drawing.scene_drawing import Polyline
 from gelflow.sim.reductions import TactileReduction, pad_forces, pad_pressures
 from gelflow.sim.scene import Scene
@@ -63,9 +62,8 @@ class CapRotationTask(ControlDescription):
         super().__post_init__()
         if self.reward not in REWARDS:
             raise UsageError(f"reward must be one of {', '.join(REWARDS)}, got {self.reward!r}")
-        units = ("length_unit", "pressure_unit", "force_unit", "command_unit")
-        check_settings(self, goal_angle=POSITIVE, **dict.fromkeys(units, POSITIVE))
-        check_settings(self, action_scale=NOT_NEGATIVE, contact_force=NOT_NEGATIVE)
+        self.check_positive("goal_angle", "length_unit", "pressure_unit", "force_unit", "command_unit")
+        self.check_not_negative("action_scale", "contact_force")
 
     @property
     def observation_size(self) -> int:

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.observation import MIN_DIVISORS, Grid, normalize
-from gelflow.ranges import POSITIVE, check_settings
 from gelflow.sim.scene import Scene, load_scene
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.tasks.gripper.attempt_task import AttemptTask
@@ -65,8 +64,8 @@ class GraspTask(TaskDescription):
             raise UsageError(f"sensors must be {len(PADS)} and attempts at least 1, got {given}")
         if min(times := (self.close_time, self.lift_time, self.hold_time)) < 0 or not self.lift_time > 0:
             raise UsageError(f"close_time, lift_time and hold_time must not be negative, lift_time not 0, got {times}")
-        if self.force_range is not None:
-            check_settings(self, force_range=(POSITIVE, 2))
+        if self.force_range is not None and len(self.force_range) != 2:
+            raise UsageError(f"force_range must be (low, high), got {self.force_range}")
         if self.force_range is not None and not 0 < self.force_range[0] < self.force_range[1] <= 20:
             raise UsageError(f"force_range must be 0 < low < high ≤ 20 N, got {self.force_range}")
 

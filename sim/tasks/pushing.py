@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
 from gelflow.observation import Grid
-from gelflow.ranges import NOT_NEGATIVE, POSITIVE, SHARE, check_ordered, check_settings
 from gelflow.sim.drawing.scene_drawing import Polyline
 from gelflow.sim.tasks.control_task import ControlDescription, ControlTask
 from gelflow.sim.tasks.randomization import Fixed, Quantity, Randomization
@@ -74,12 +73,10 @@ class PushingTask(ControlDescription):
             raise UsageError(f"observation must be one of {', '.join(OBSERVATIONS)}, got {self.observation!r}")
         if self.history < 1:
             raise UsageError(f"history must be at least 1, got {self.history}")
-        positive = ("force_period", "position_tolerance", "yaw_tolerance", "touch_distance")
-        units = ("goal_unit", "yaw_unit", "marker_unit", "box_unit", "mass_unit")
-        check_settings(self, **dict.fromkeys(positive + units, POSITIVE))
-        check_settings(self, **dict.fromkeys(("goal_yaw_spread", "start_offset", "force"), NOT_NEGATIVE))
-        check_settings(self, action_scale=(NOT_NEGATIVE, 3), no_force=SHARE)
-        check_ordered(self, "goal_x", "goal_y")
+        self.check_ordered("goal_x", "goal_y")
+        self.check_positive("force_period", "position_tolerance", "yaw_tolerance", "touch_distance")
+        self.check_positive("goal_unit", "yaw_unit", "marker_unit", "box_unit", "mass_unit")
+        self.check_not_negative("action_scale", "goal_yaw_spread", "start_offset", "force", "no_force")
 
     @property
     def frame_size(self) -> int:

@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.observation import Grid
-from gelflow.ranges import POSITIVE, check_ordered, check_settings
 from gelflow.sim.drawing.scene_drawing import Polyline
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.tasks.control_task import ControlDescription, ControlTask
@@ -49,9 +48,8 @@ class RollingTask(ControlDescription):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        positive = ("tolerance", "rest_speed", "pad_half_size", "length_unit", "speed_unit", "marker_unit")
-        check_settings(self, **dict.fromkeys(positive, POSITIVE))
-        check_ordered(self, "goal_distance")
+        self.check_ordered("goal_distance")
+        self.check_positive("tolerance", "rest_speed", "pad_half_size", "length_unit", "speed_unit", "marker_unit")
 
     @property
     def observation_size(self) -> int:

@@ -20,7 +20,6 @@ from gelflow.errors import UsageError
 from gelflow.geometry import compose_planar, rotated
 from gelflow.observation import Grid
 from gelflow.part import CUBOID, Part
-from gelflow.ranges import NOT_NEGATIVE, POSITIVE, check_settings
 
 _START_ABOVE_RIM = 0.5e-3  # [m] of the lower face at the start of an attempt
 _SUCCESS_BELOW_RIM = 0.3e-3  # [m]
@@ -75,6 +74,25 @@ class TaskDescription:
         """A short hash: equal for equal descriptions."""
         return hashlib.sha256(json.dumps(self.to_json(), sort_keys=True).encode()).hexdigest()[:16]
 
+    def check_positive(self, *names: str) -> None:
+        """Raise UsageError for the first of these fields with a number that is not above 0."""
+        for name in names:
+            if np.any(np.asarray(value := getattr(self, name)) <= 0):
+                raise UsageError(f"{name} must be above 0, got {value}")
+
+    def check_not_negative(self, *names: str) -> None:
+        """Raise UsageError for the first of these fields with a negative number."""
+        for name in names:
+            if np.any(np.asarray(value := getattr(self, name)) < 0):
+                raise UsageError(f"{name} must not be negative, got {value}")
+
+    def check_ordered(self, *names: str) -> None:
+        """Raise UsageError for the first of these ranges (low, high) whose low end is above the high one."""
+        for name in names:
+            low, high = getattr(self, name)
+            if low > high:
+                raise UsageError(f"{name} must be (low, high), got {(low, high)}")
+
 
 def _expected(field: "dataclasses.Field[Any]", value: Any) -> str | None:
     """The type and range that a value should have and has not, by the default of its field; None if it has them."""
@@ -128,11 +146,10 @@ class InsertionTask(TaskDescription):
         super().__post_init__()
         if self.observation not in OBSERVATIONS:
             raise UsageError(f"observation must be one of {', '.join(OBSERVATIONS)}, got {self.observation!r}")
-        vector = (NOT_NEGATIVE, 3)
-        check_settings(self, attempts=POSITIVE, descent=POSITIVE, start_height=POSITIVE)
-        check_settings(self, action_scale=vector, workspace=vector, misalignment=vector)
-        if not self.frame_depths or min(self.frame_depths) < 0:
-            raise UsageError(f"frame_depths must be at least one depth, none negative, got {self.frame_depths}")
+        self.check_positive("attempts", "descent", "start_height")
+        self.check_not_negative("frame_depths", "action_scale", "workspace", "misalignment")
+        if not self.frame_depths:
+            raise UsageError("frame_depths must have at least one depth")
 
     def to_json(self) -> dict[str, Any]:
         """As plain data, without cuboid and flow map, so that it is that of checkpoints of earlier versions."""

@@ -187,7 +187,7 @@ def test_inaccurate_run_is_reported(capsys: pytest.CaptureFixture[str]) -> None:
     """A loose Newton tolerance gives force errors above 1e-4."""
     scene = load_scene("insertion", friction="elastic")
     run = motion_run(scene, steps=60)
-    right, loose = (simulator(scene.model_spec, tolerance=tolerance) for tolerance in (1e-7, 0.3))
+    right, loose = (simulator(scene.model_spec, tolerance=tolerance) for tolerance in (1e-7, 0.1))
     assert check_accuracy(run, right, scene.model_spec).violations("insertion") == []
     lines = check_accuracy(run, loose, scene.model_spec).violations("insertion")
     assert len(lines) == 1 and lines[0].startswith("insertion: ")

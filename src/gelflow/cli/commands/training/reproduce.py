@@ -20,7 +20,9 @@ TASKS = ("grasp", "pushing", "cap", "insertion")  # those of `gelflow.policies.r
 def configure(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
     parser.add_argument("task", choices=[*TASKS, "all"], help="task, or all of them one after another")
-    parser.add_argument("--seeds", type=int, metavar="N", help="trainings of each variant (default: 3; with --quick 1)")
+    parser.add_argument(
+        "--seeds", type=int, metavar="N", help="trainings of each variant (default: 3, for a short run 1)"
+    )
     add_seed(parser)
     add_quick(parser)
     add_out(parser, "folder of trainings and results (default runs/reproduce); the same command continues", folder=True)

@@ -46,11 +46,3 @@ def check_settings(settings: object, **ranges: Range | tuple[Range, int]) -> Non
             text = f"{count} values, each {of_member.text}"
         if not valid:
             raise UsageError(f"{type(settings).__name__}: {name} must be {text}, got {value!r}")
-
-
-def check_ordered(settings: object, *names: str) -> None:
-    """Raises UsageError for a field (low, high) whose low end is above the high one."""
-    for name in names:
-        low, high = getattr(settings, name)
-        if low > high:
-            raise UsageError(f"{type(settings).__name__}: {name} must be (low, high), got {(low, high)}")
