@@ -246,9 +246,11 @@ class Pushing(ControlTask):
         check_options(task.name, options, _RESET_OPTIONS)
         shapes = {"goal": (3,), "half_size": (2,)}
         given = {name: option_rows(name, value, which, shapes.get(name, ())) for name, value in options.items()}
-        if any((given[name] <= 0).any() for name in ("half_size", "mass") if name in given):
-            raise UsageError("reset: half_size and mass must be above 0")
         drawn = self.randomization.sample(rng, len(rows), friction=self.scene.friction)
+        half_size = given.get("half_size", np.column_stack([drawn["half_size_x"], drawn["half_size_y"]]))
+        mass = given.get("mass", drawn["mass"])
+        if (half_size <= 0).any() or (mass <= 0).any():
+            raise UsageError("reset: half_size and mass must be above 0")
         self._sensors.draw(which, drawn, rng)
         self.sim.param("box_ground.mu")[rows] = drawn["ground_mu"]
         y = rng.uniform(*task.goal_y, len(rows))
@@ -256,8 +258,8 @@ class Pushing(ControlTask):
         values = {
             "goal": np.column_stack([rng.uniform(*task.goal_x, len(rows)), y, yaw]),
             "offset": rng.uniform(-task.start_offset, task.start_offset, len(rows)),
-            "half_size": np.column_stack([drawn["half_size_x"], drawn["half_size_y"]]),
-            "mass": drawn["mass"],
+            "half_size": half_size,
+            "mass": mass,
         } | given
         drawn |= dict(zip(_START_UNITS, (*values["goal"].T, values["offset"]), strict=True))
         drawn |= dict(
