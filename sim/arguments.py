@@ -103,6 +103,12 @@ def number_array(name: str, value: ArrayLike, dtype: Any) -> NDArray[Any]:
         raise UsageError(f"{name} must be numeric: {' '.join(str(error).split())}") from None
 
 
+def check_mask(mask: NDArray[Any], count: int) -> None:
+    """Raise UsageError unless `mask` is a mask of `count` environments; integers would be indices."""
+    if mask.shape != (count,) or mask.dtype != bool:
+        raise UsageError(f"a mask of environments must be ({count},) bool, got {mask.shape} {mask.dtype}")
+
+
 def floating(values: Any) -> Any:
     """An array or tensor; integers and flags as numbers in double precision."""
     if isinstance(values, np.ndarray):

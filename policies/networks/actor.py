@@ -17,11 +17,11 @@ from gelflow.policies.networks.base import (
     BatchPolicy,
     Network,
     Tensors,
-    check_mask,
     check_observations,
     check_tensors,
 )
 from gelflow.policies.networks.layers import gru_cell, linear
+from gelflow.sim.arguments import check_mask
 from gelflow.task import TaskDescription
 
 if TYPE_CHECKING:
@@ -103,7 +103,7 @@ class ActorPolicy(BatchPolicy):
 
     def reset(self, which: NDArray[np.bool_]) -> None:
         """Clears the memory of the environments marked in `which`."""
-        check_mask(which, len(self._memory))
+        check_mask(np.asarray(which), len(self._memory))
         self._memory[which] = 0
 
     def act(self, observations: NDArray[Any]) -> Array:

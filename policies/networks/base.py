@@ -86,10 +86,3 @@ def check_observations(observations: NDArray[Any], shape: tuple[int, ...]) -> No
     if not np.isfinite(observations).all():
         wrong = np.flatnonzero(~np.isfinite(observations.reshape(len(observations), -1)).all(1))
         raise UsageError(f"observation {wrong[0]} has values that are not finite")
-
-
-def check_mask(which: NDArray[np.bool_], count: int) -> None:
-    """Raises UsageError unless `which` is a mask of `count` environments; integers would be indices."""
-    given = np.asarray(which)
-    if given.dtype != bool or given.shape != (count,):
-        raise UsageError(f"a mask of environments must be ({count},) bool, got {given.shape} {given.dtype}")

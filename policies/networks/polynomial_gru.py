@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
-from gelflow.policies.networks.base import Architecture, Array, Tensors, check_mask, check_tensors
+from gelflow.policies.networks.base import Architecture, Array, Tensors, check_tensors
 from gelflow.policies.networks.flow_map_policy import (
     CorrectionPolicy,
     FlowMapNetwork,
@@ -24,6 +24,7 @@ from gelflow.policies.networks.layers import gru_cell, linear
 from gelflow.policies.networks.mirror_symmetry import reflections
 from gelflow.policies.networks.polynomial_features import num_features, reduce_maps
 from gelflow.policies.ranges import COUNT, COUNT_FROM_0, POSITIVE, check_settings
+from gelflow.sim.arguments import check_mask
 from gelflow.task import InsertionTask, TaskDescription
 
 _MOTION = 6  # inputs beside the features: the latest correction, and the displacement from the start
@@ -141,7 +142,7 @@ class PolynomialGRUPolicy(CorrectionPolicy):
 
     def reset(self, which: NDArray[np.bool_]) -> None:
         """Clears the memory of the parts marked in `which`."""
-        check_mask(which, self._count)
+        check_mask(np.asarray(which), self._count)
         for array in (self._state, self._correction, self._displacement):
             array[which] = 0
         self.new[which] = True

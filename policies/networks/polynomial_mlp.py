@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import UsageError
-from gelflow.policies.networks.base import Architecture, Tensors, check_mask, check_tensors
+from gelflow.policies.networks.base import Architecture, Tensors, check_tensors
 from gelflow.policies.networks.flow_map_policy import (
     CorrectionPolicy,
     FlowMapNetwork,
@@ -24,6 +24,7 @@ from gelflow.policies.networks.layers import linear
 from gelflow.policies.networks.mirror_symmetry import MirrorSymmetry
 from gelflow.policies.networks.polynomial_features import num_features, reduce_maps
 from gelflow.policies.ranges import COUNT, COUNT_FROM_0, POSITIVE, check_settings
+from gelflow.sim.arguments import check_mask
 from gelflow.task import InsertionTask, TaskDescription
 
 Array = NDArray[np.float64]
@@ -178,7 +179,7 @@ class PolynomialPolicy(CorrectionPolicy):
 
     def reset(self, which: NDArray[np.bool_]) -> None:
         """Clears the history of the parts marked in `which`."""
-        check_mask(which, self._count)
+        check_mask(np.asarray(which), self._count)
         self._history.reset(which)
 
     def corrections(self, images: NDArray[Any]) -> Array:

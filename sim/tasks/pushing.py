@@ -258,23 +258,19 @@ class Pushing(ControlTask):
         values = {
             "goal": np.column_stack([rng.uniform(*task.goal_x, len(rows)), y, yaw]),
             "offset": rng.uniform(-task.start_offset, task.start_offset, len(rows)),
-            "half_size": half_size,
-            "mass": mass,
         } | given
         drawn |= dict(zip(_START_UNITS, (*values["goal"].T, values["offset"]), strict=True))
-        drawn |= dict(
-            zip(("half_size_x", "half_size_y", "mass"), (*values["half_size"].T, values["mass"]), strict=True)
-        )
+        drawn |= {"half_size_x": half_size[:, 0], "half_size_y": half_size[:, 1], "mass": mass}
         self._record(which, drawn, self.randomization, **_START_UNITS)
         periods = self._external_force.shape[1]
         force = rng.uniform(-task.force, task.force, (len(rows), periods, 2))
         self._external_force[rows] = force * (rng.random((len(rows), periods, 1)) >= task.no_force)
-        self.goal[rows], self.half_size[rows], self.mass[rows] = values["goal"], values["half_size"], values["mass"]
+        self.goal[rows], self.half_size[rows], self.mass[rows] = values["goal"], half_size, mass
         self._action[rows] = 0
         self._set_box(rows)
         self.sim.reset(which)
         # The side of a box of any size is at the same distance from the finger.
-        self.sim.q[rows, self._box_q[0]] += values["half_size"][:, 0] - self._half_size[0]
+        self.sim.q[rows, self._box_q[0]] += half_size[:, 0] - self._half_size[0]
         self.sim.q[rows, self._box_q[1]] = values["offset"]
 
     def _set_box(self, rows: NDArray[np.int64]) -> None:

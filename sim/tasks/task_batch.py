@@ -10,7 +10,7 @@ from gymnasium.spaces import Box
 from numpy.typing import ArrayLike, NDArray
 
 from gelflow.errors import SimulationError, UsageError
-from gelflow.sim.arguments import integer, number_array
+from gelflow.sim.arguments import check_mask, integer, number_array
 from gelflow.sim.tasks.randomization import Randomization
 from gelflow.task import TaskDescription
 from gelflow.toml_tables import suggestion
@@ -169,8 +169,7 @@ class TaskBatch(ABC):
 
     def _mask(self, which: ArrayLike) -> Mask:
         mask = np.array(which)  # a copy: `which` may be a result of the batch, which changes
-        if mask.shape != (self.num_envs,) or mask.dtype != bool:
-            raise UsageError(f"a mask of environments must be ({self.num_envs},) bool, got {mask.shape} {mask.dtype}")
+        check_mask(mask, self.num_envs)
         return mask
 
 

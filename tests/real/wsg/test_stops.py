@@ -24,6 +24,7 @@ from tests.real.wsg.harness import (
 )
 
 from gelflow.errors import PeerError, PeerRefused, PeerTimeout, SafetyError
+from gelflow.hardware_mocks.plant import KinematicGripper
 from gelflow.hardware_mocks.wsg.finger_controller import MockWsgConfig
 from gelflow.interrupts import Interrupted, interruptible
 from gelflow.protocols import GripperState
@@ -35,6 +36,27 @@ from gelflow.real.wsg.driver import WsgGripper
 from gelflow.real.wsg.link import WsgLink
 
 MOTION_IDS = {Command.HOME, Command.PRE_POSITION, Command.STOP, Command.FAST_STOP, Command.GRASP, Command.RELEASE}
+
+
+def assert_stopped_early(plant: KinematicGripper) -> None:
+    """The fingers are at rest, and have hardly moved from 110 mm."""
+    width = plant.gripper_state()[0]
+    time.sleep(0.05)
+    assert plant.gripper_state()[0] == width > 0.09
+
+
+def grasp_without_result(gripper: WsgGripper, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A grasp that begins, and whose replies do not arrive."""
+    link = gripper._link
+    assert link is not None
+
+    def no_result(packet: Packet, *, timeout: float, stops: int) -> None:
+        link.send(packet)
+        raise PeerTimeout("no result")
+
+    monkeypatch.setattr(link, "run", no_result)
+    with pytest.raises(PeerTimeout, match="no result"):
+        gripper.grasp(width=0.010, speed=0.005, force=20)
 
 
 def test_fast_stop_forbids_motion_until_acknowledged() -> None:
@@ -130,16 +152,7 @@ def test_a_stop_that_came_too_early_is_sent_again_after_the_pause(monkeypatch: p
     device = MockWsgConfig(shortest_command_interval=0.1, stops_at_any_rate=False)
     with connected(device=device, config=replace(CONFIG, command_interval=0.5)) as (gripper, _, plant, record):
         gripper.home()
-        link = gripper._link
-        assert link is not None
-
-        def no_result(packet: Packet, *, timeout: float, stops: int) -> None:
-            link.send(packet)
-            raise PeerTimeout("no result")
-
-        monkeypatch.setattr(link, "run", no_result)
-        with pytest.raises(PeerTimeout):
-            gripper.grasp(width=0.010, speed=0.005, force=20)
+        grasp_without_result(gripper, monkeypatch)
         assert record.names[-1] == "stop" and record.names.count("stop") <= 2  # one if this computer was interrupted
         eventually(lambda: plant.gripper_state()[1] == 0.0, "the fingers were not stopped")
         assert plant.gripper_state()[0] > 0.09
@@ -156,22 +169,14 @@ def test_close_repeats_a_stop_that_was_not_confirmed(monkeypatch: pytest.MonkeyP
         def lost(packet: Packet, **_: object) -> None:
             raise PeerTimeout("no answer")
 
-        def no_result(packet: Packet, **_: object) -> None:
-            link.send(packet)
-            raise PeerTimeout("no result")
-
         with monkeypatch.context() as silent:
             silent.setattr(link, "request", lost)
             silent.setattr(gripper, "_limit_force", lambda link, force: None)
-            silent.setattr(link, "run", no_result)
-            with pytest.raises(PeerTimeout):
-                gripper.grasp(width=0.010, speed=0.005, force=20)
+            grasp_without_result(gripper, silent)
         monkeypatch.setattr(gripper._values, "state", lambda corrupt: idle)
         gripper.close()
         assert record.names[-2:] == ["stop", "disconnect"]
-        width = plant.gripper_state()[0]
-        time.sleep(0.05)
-        assert plant.gripper_state()[0] == width > 0.09
+        assert_stopped_early(plant)
 
 
 def test_close_during_a_motion_stops_the_fingers() -> None:
@@ -182,9 +187,7 @@ def test_close_during_a_motion_stops_the_fingers() -> None:
         gripper.close()
         thread.join(PATIENT)
         assert errors
-        width = plant.gripper_state()[0]
-        time.sleep(0.05)
-        assert plant.gripper_state()[0] == width > 0.09
+        assert_stopped_early(plant)
 
 
 def test_close_with_a_held_part_keeps_the_grip() -> None:
@@ -204,24 +207,13 @@ def test_close_after_a_grasp_without_a_result_stops_the_fingers(monkeypatch: pyt
     """The stop after it was lost too: the device still reports that it grasps."""
     with connected() as (gripper, _, plant, record):
         gripper.home()
-        link = gripper._link
-        assert link is not None
-
-        def no_result(packet: Packet, *, timeout: float, stops: int) -> None:
-            link.send(packet)
-            raise PeerTimeout("no result")
-
-        monkeypatch.setattr(link, "run", no_result)
         with monkeypatch.context() as lost:
             lost.setattr(gripper, "_stop_twice", lambda link: None)
-            with pytest.raises(PeerTimeout):
-                gripper.grasp(width=0.010, speed=0.005, force=20)
+            grasp_without_result(gripper, lost)
         eventually(lambda: gripper.state().grasp == "grasping", "the grasp did not start")
         gripper.close()
         assert record.names[-2:] == ["stop", "disconnect"]
-        width = plant.gripper_state()[0]
-        time.sleep(0.05)
-        assert plant.gripper_state()[0] == width > 0.09
+        assert_stopped_early(plant)
 
 
 def test_unannounced_disconnect_leaves_fast_stop_and_the_held_part() -> None:
