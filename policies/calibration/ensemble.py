@@ -8,6 +8,7 @@ drawn from the prior, the later ones around the best member so far.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,7 @@ _ROUNDS = 20  # of one ensemble, at most
 _LATER_ROUNDS = 10
 _SPREADS = (0.5, 0.3)  # of the ensembles around the best member, relative to the prior
 _FIRST = 1.7  # largest initial value of a whitened parameter
+_SMALLER, _REPEATED = 0.25, 3  # relative share of an update that is repeated, and how often it is at most
 _MODEL_ERROR = 0.04  # that residuals allow for, relative to the flow maps
 
 
@@ -85,48 +87,84 @@ def search_nearby(
     return _invert(problem, points, members_poses, _LATER_ROUNDS, rng)
 
 
+@dataclass(frozen=True)
+class _Ensemble:
+    """Guesses of the unknowns (members, size) and poses (members, insertions, 3), and what they predict."""
+
+    points: Array
+    poses: Array
+    residuals: Array  # (members, data); their half squares add up to the robust cost
+    ok: NDArray[np.bool_]  # which members could be simulated, (members,)
+
+    @property
+    def most_fail(self) -> bool:
+        """Whether half of the members or more could not be simulated."""
+        return int(self.ok.sum()) <= len(self.ok) // 2
+
+    def without_failed(self, rng: np.random.Generator) -> "_Ensemble":
+        """The ensemble with random other members in the place of those that could not be simulated."""
+        members = len(self.ok)
+        kept = np.where(self.ok, np.arange(members), rng.choice(np.flatnonzero(self.ok), members))
+        return _Ensemble(self.points[kept], self.poses[kept], self.residuals[kept], self.ok[kept])
+
+
 def _invert(
     problem: Problem, points: Array, poses: Array, rounds: int, rng: np.random.Generator
 ) -> tuple[Array, Array]:
     """Unknowns and poses of the best member of all rounds."""
-    members, insertions = poses.shape[:2]
-    scale = np.tile(INSERTED_POSE_SPREAD, insertions)
     lowest, best = np.inf, (points[0], poses[0])
+    ensemble = _simulated(problem, points, poses)
+    if ensemble.most_fail and problem.readings.forces.lift_iteration_limit():
+        ensemble = _simulated(problem, points, poses)
     left = 1.0  # share of the recordings that is not yet taken into account
-    for _ in range(rounds):
-        residuals, ok = _residuals(problem, points, poses)
-        if ok.sum() <= members // 2 and problem.readings.forces.lift_iteration_limit():
-            residuals, ok = _residuals(problem, points, poses)
-        if ok.sum() <= members // 4:
+    for number in range(rounds):
+        if ensemble.ok.sum() <= len(points) // 4:
             raise SimulationError("the recorded descents cannot be simulated with most guesses of the parameters")
-        costs = np.where(ok, _costs(problem, residuals, points, poses), np.inf)
+        costs = np.where(ensemble.ok, _costs(problem, ensemble), np.inf)
         k = int(costs.argmin())
         if costs[k] < lowest:
-            lowest, best = float(costs[k]), (points[k], poses[k])
-        if left <= 0:
+            lowest, best = float(costs[k]), (ensemble.points[k], ensemble.poses[k])
+        if left <= 0 or number == rounds - 1:
             break
-        replaced = np.where(ok, np.arange(members), rng.choice(np.flatnonzero(ok), members))
-        residuals, points, poses = residuals[replaced], points[replaced], poses[replaced]
-        share = min(left, _share(residuals, float(problem.errors.num_independent.sum())))
+        ensemble = ensemble.without_failed(rng)
+        share = min(left, _share(ensemble.residuals, float(problem.errors.num_independent.sum())))
+        ensemble, share = _moved(problem, ensemble, share, rng)
         left = left - share if share < left else 0.0
-        unknowns = np.hstack([points, poses.reshape(members, -1) / scale])
-        unknowns = _updated(unknowns, residuals, share, rng)
-        points = np.clip(unknowns[:, : problem.size], -FARTHEST, FARTHEST)
-        poses = (unknowns[:, problem.size :] * scale).reshape(poses.shape)
     return best
 
 
-def _residuals(problem: Problem, points: Array, poses: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Residuals (members, data) whose half squares add up to the robust cost, and which members could be simulated."""
+def _simulated(problem: Problem, points: Array, poses: Array) -> _Ensemble:
     whitened, ok = problem.residuals_of(points, poses)
     robust = problem.errors.robust(whitened)
-    return robust.reshape(len(points), -1), np.asarray(ok.all(axis=1))
+    return _Ensemble(points, poses, robust.reshape(len(points), -1), np.asarray(ok.all(axis=1)))
 
 
-def _costs(problem: Problem, residuals: Array, points: Array, poses: Array) -> Array:
+def _moved(problem: Problem, ensemble: _Ensemble, share: float, rng: np.random.Generator) -> tuple[_Ensemble, float]:
+    """The ensemble after an update, and the share of the recordings that it took into account.
+
+    An update that leads most members to where descents cannot be simulated, or only slowly, went too far: it is
+    repeated with a smaller share. Where that does not help, the iteration limit is lifted.
+    """
+    members, insertions = ensemble.poses.shape[:2]
+    scale = np.tile(INSERTED_POSE_SPREAD, insertions)
+    before = np.hstack([ensemble.points, ensemble.poses.reshape(members, -1) / scale])
+    for repeated in range(_REPEATED + 1):
+        share *= _SMALLER if repeated else 1.0
+        unknowns = _updated(before, ensemble.residuals, share, rng)
+        points = np.clip(unknowns[:, : problem.size], -FARTHEST, FARTHEST)
+        poses = (unknowns[:, problem.size :] * scale).reshape(ensemble.poses.shape)
+        moved = _simulated(problem, points, poses)
+        if not moved.most_fail:
+            break
+    if moved.most_fail and problem.readings.forces.lift_iteration_limit():
+        moved = _simulated(problem, points, poses)
+    return moved, share
+
+
+def _costs(problem: Problem, ensemble: _Ensemble) -> Array:
     """Robust negative log posterior of each member."""
-    prior = 0.5 * (points**2).sum(1) + prior_cost_of_all(problem, poses)
-    return np.asarray(0.5 * (residuals**2).sum(1) + prior)
+    prior = 0.5 * (ensemble.points**2).sum(1) + prior_cost_of_all(problem, ensemble.poses)
+    return np.asarray(0.5 * (ensemble.residuals**2).sum(1) + prior)
 
 
 def _share(residuals: Array, independent: float) -> float:

@@ -11,7 +11,7 @@ from gelflow.policies.calibration.experiment.worlds import RecordedWorld
 from gelflow.policies.calibration.model.fidelity import ROUGH
 from gelflow.policies.calibration.pose_search import better_poses
 from gelflow.policies.calibration.poses import costs_of_insertions, draw_poses
-from gelflow.policies.calibration.problem import Problem
+from gelflow.policies.calibration.problem import Array, Problem
 
 
 @pytest.mark.parametrize("share", [1.0, 0.1])
@@ -41,14 +41,13 @@ def test_the_search_finds_unknowns_that_no_random_guess_comes_near(world: Record
     problem = Problem(world.recordings.of(np.arange(2)), fidelity=ROUGH)
     problem.allow_for(model_error=0.04)
     point, poses = ensemble.search_globally(problem, 96, np.random.default_rng(0))
-    residuals, ok = ensemble._residuals(problem, point[None], poses[None])
-    found = ensemble._costs(problem, residuals, point[None], poses[None])[0]
+    found = ensemble._simulated(problem, point[None], poses[None])
     rng = np.random.default_rng(1)
     points = np.clip(rng.normal(size=(200, problem.size)), -1.7, 1.7)
     guessed = np.stack([draw_poses(problem, i, 200, rng) for i in range(2)], axis=1)
-    residuals, _ = ensemble._residuals(problem, points, guessed)
-    assert ok.all()
-    assert found < 0.1 * ensemble._costs(problem, residuals, points, guessed).min()
+    guesses = ensemble._simulated(problem, points, guessed)
+    assert found.ok.all()
+    assert ensemble._costs(problem, found)[0] < 0.1 * ensemble._costs(problem, guesses).min()
 
 
 def test_wrong_poses_are_replaced_and_right_ones_kept(world: RecordedWorld) -> None:
@@ -71,6 +70,39 @@ def test_guesses_that_cannot_be_simulated_end_the_search(world: RecordedWorld, m
     monkeypatch.setattr(problem, "predicted", lambda *given: (predicted(*given)[0], np.zeros(len(given[1]), np.bool_)))
     with pytest.raises(SimulationError, match="most guesses"):
         ensemble.search_globally(problem, 8, np.random.default_rng(0))
+
+
+def _near_truth(world: RecordedWorld) -> tuple[Problem, ensemble._Ensemble]:
+    """One recorded insertion, and eight guesses with its pose."""
+    problem = Problem(world.recordings.of(np.arange(1)), threads=1, fidelity=ROUGH)
+    points = 0.1 * np.random.default_rng(0).normal(size=(8, problem.size))
+    return problem, ensemble._simulated(problem, points, np.repeat(world.misalignment[None, :1], 8, axis=0))
+
+
+def test_an_update_that_goes_too_far_is_repeated_with_a_smaller_share(
+    world: RecordedWorld, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem, start = _near_truth(world)
+    limit = problem.readings.forces.scene.max_step_iterations
+    changes, simulated = [], ensemble._simulated
+
+    def only_small_changes(problem: Problem, points: Array, poses: Array) -> ensemble._Ensemble:
+        changes.append(float(np.abs(points - start.points).mean()))
+        return dataclasses.replace(simulated(problem, points, poses), ok=np.full(8, changes[-1] < 0.5 * changes[0]))
+
+    monkeypatch.setattr(ensemble, "_simulated", only_small_changes)
+    moved, share = ensemble._moved(problem, start, 1.0, np.random.default_rng(1))
+    assert moved.ok.all() and len(changes) > 1
+    assert share == ensemble._SMALLER ** (len(changes) - 1)
+    assert problem.readings.forces.scene.max_step_iterations == limit
+
+
+def test_the_iteration_limit_is_lifted_where_a_smaller_share_does_not_help(world: RecordedWorld) -> None:
+    problem, start = _near_truth(world)
+    limited = Problem(problem.recordings, threads=1, fidelity=dataclasses.replace(ROUGH, iteration_limit=1))
+    moved, share = ensemble._moved(limited, start, 1.0, np.random.default_rng(1))
+    assert moved.ok.all()
+    assert share == ensemble._SMALLER**ensemble._REPEATED
 
 
 def test_an_iteration_limit_that_most_guesses_exceed_is_lifted(world: RecordedWorld) -> None:
