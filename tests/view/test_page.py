@@ -104,6 +104,18 @@ def test_other_sites_get_no_answer(page: Page) -> None:
     assert get(page, Host=f"localhost:{page.port}").status == 200
 
 
+def test_malformed_requests_are_refused(page: Page, open_page: Page) -> None:
+    for served in (page, open_page):
+        assert get(served, Host="[").status == 403
+        assert get(served, Origin="http://[").status == 403
+        assert get(served, "//[").status == 403
+        connection = http.client.HTTPConnection("127.0.0.1", served.port, timeout=20)
+        connection.putrequest("GET", "/")  # with a host
+        connection.putheader("Host", "localhost")
+        connection.endheaders()
+        assert connection.getresponse().status == 403
+
+
 def test_two_pages_have_different_tokens() -> None:
     pages = [Page(host="0.0.0.0", port=0) for _ in range(2)]
     assert len({token_of(page) for page in pages}) == 2

@@ -41,15 +41,17 @@ class Access:
 
     def refusal(self, path: str, headers: Any, port: int) -> str | None:
         """The reason why a request is refused; None if it is allowed."""
-        name = urlsplit(f"//{headers.get('Host', '')}")
-        if self.token is None and (name.hostname is None or not is_loopback(name.hostname)):
+        hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
+        try:
+            (name,) = (urlsplit(f"//{host}") for host in hosts)
+            if any(urlsplit(origin).netloc != name.netloc for origin in origins):
+                return _FOREIGN
+            token = _query_token(path)
+        except ValueError:  # several hosts, or a malformed address
             return _FOREIGN
-        origin = headers.get("Origin")
-        if origin is not None and urlsplit(origin).netloc != name.netloc:
-            return _FOREIGN
-        if self.token is None or self._is_token(_query_token(path)) or self._is_token(_cookie_token(headers, port)):
-            return None
-        return _REFUSED
+        if self.token is None:
+            return None if name.hostname is not None and is_loopback(name.hostname) else _FOREIGN
+        return None if self._is_token(token) or self._is_token(_cookie_token(headers, port)) else _REFUSED
 
     def _is_token(self, given: str) -> bool:
         assert self.token is not None
