@@ -26,7 +26,7 @@ _ROUNDS = 20  # of one ensemble, at most
 _LATER_ROUNDS = 10
 _SPREADS = (0.5, 0.3)  # of the ensembles around the best member, relative to the prior
 _FIRST = 1.7  # largest initial value of a whitened parameter
-_SMALLER, _REPEATED = 0.25, 3  # relative share of an update that is repeated, and how often it is at most
+_FACTORS = (1.0, 1 / 4, 1 / 16, 1 / 64)  # of the share of an update: each is tried where the one before went too far
 _MODEL_ERROR = 0.04  # that residuals allow for, relative to the flow maps
 
 
@@ -113,9 +113,7 @@ def _invert(
 ) -> tuple[Array, Array]:
     """Unknowns and poses of the best member of all rounds."""
     lowest, best = np.inf, (points[0], poses[0])
-    ensemble = _simulated(problem, points, poses)
-    if ensemble.most_fail and problem.readings.forces.lift_iteration_limit():
-        ensemble = _simulated(problem, points, poses)
+    ensemble = _without_limit(problem, _simulated(problem, points, poses))
     left = 1.0  # share of the recordings that is not yet taken into account
     for number in range(rounds):
         if ensemble.ok.sum() <= len(points) // 4:
@@ -139,6 +137,13 @@ def _simulated(problem: Problem, points: Array, poses: Array) -> _Ensemble:
     return _Ensemble(points, poses, robust.reshape(len(points), -1), np.asarray(ok.all(axis=1)))
 
 
+def _without_limit(problem: Problem, ensemble: _Ensemble) -> _Ensemble:
+    """The ensemble; simulated without the iteration limit, from now on, where most members fail with it."""
+    if ensemble.most_fail and problem.readings.forces.lift_iteration_limit():
+        return _simulated(problem, ensemble.points, ensemble.poses)
+    return ensemble
+
+
 def _moved(problem: Problem, ensemble: _Ensemble, share: float, rng: np.random.Generator) -> tuple[_Ensemble, float]:
     """The ensemble after an update, and the share of the recordings that it took into account.
 
@@ -148,17 +153,14 @@ def _moved(problem: Problem, ensemble: _Ensemble, share: float, rng: np.random.G
     members, insertions = ensemble.poses.shape[:2]
     scale = np.tile(INSERTED_POSE_SPREAD, insertions)
     before = np.hstack([ensemble.points, ensemble.poses.reshape(members, -1) / scale])
-    for repeated in range(_REPEATED + 1):
-        share *= _SMALLER if repeated else 1.0
-        unknowns = _updated(before, ensemble.residuals, share, rng)
+    for factor in _FACTORS:
+        unknowns = _updated(before, ensemble.residuals, factor * share, rng)
         points = np.clip(unknowns[:, : problem.size], -FARTHEST, FARTHEST)
         poses = (unknowns[:, problem.size :] * scale).reshape(ensemble.poses.shape)
         moved = _simulated(problem, points, poses)
         if not moved.most_fail:
             break
-    if moved.most_fail and problem.readings.forces.lift_iteration_limit():
-        moved = _simulated(problem, points, poses)
-    return moved, share
+    return _without_limit(problem, moved), factor * share
 
 
 def _costs(problem: Problem, ensemble: _Ensemble) -> Array:

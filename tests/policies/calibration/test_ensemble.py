@@ -93,7 +93,7 @@ def test_an_update_that_goes_too_far_is_repeated_with_a_smaller_share(
     monkeypatch.setattr(ensemble, "_simulated", only_small_changes)
     moved, share = ensemble._moved(problem, start, 1.0, np.random.default_rng(1))
     assert moved.ok.all() and len(changes) > 1
-    assert share == ensemble._SMALLER ** (len(changes) - 1)
+    assert share == 0.25 ** (len(changes) - 1)
     assert problem.readings.forces.scene.max_step_iterations == limit
 
 
@@ -102,7 +102,7 @@ def test_the_iteration_limit_is_lifted_where_a_smaller_share_does_not_help(world
     limited = Problem(problem.recordings, threads=1, fidelity=dataclasses.replace(ROUGH, iteration_limit=1))
     moved, share = ensemble._moved(limited, start, 1.0, np.random.default_rng(1))
     assert moved.ok.all()
-    assert share == ensemble._SMALLER**ensemble._REPEATED
+    assert share == 0.25**3
 
 
 def test_an_iteration_limit_that_most_guesses_exceed_is_lifted(world: RecordedWorld) -> None:
