@@ -16,7 +16,7 @@ from gelflow.sim.reductions import TactileReduction
 from gelflow.sim.simulator_copy import contents, rebuilt
 from gelflow.sim.site_poses import site_poses
 from gelflow.sim.state_arrays import StateArrays
-from gelflow.sim.trajectory import TouchStop, Trajectory, TrajectoryGradient
+from gelflow.sim.trajectory import TouchStop, Trajectory, TrajectoryGradient, check_complete, state_rows
 
 STATUS_MESSAGES = {
     0: "ok",
@@ -289,6 +289,7 @@ class Simulator(StateArrays):
         reduction: TactileReduction | None = None,
         active: ArrayLike | None = None,
         stop: TouchStop | None = None,
+        end_only: bool = False,
         out: Trajectory | None = None,
     ) -> Trajectory:
         """Record steps with controls u (steps, N, nu), from the given or the present state; the state is not changed.
@@ -301,6 +302,7 @@ class Simulator(StateArrays):
         reduction: record this function of the marker forces instead of the forces
         active: mask (N,); the others rest, cost nothing, and have readings of zero, or with `out` those in `out`
         stop: stops environments on touch
+        end_only: record the last state only, which saves memory and time; such a rollout has no gradient
         out: an earlier trajectory of the same shape whose arrays are overwritten, by a refused call too; saves time
 
         Raises UsageError for wrong shapes and for values that are not finite.
@@ -313,16 +315,17 @@ class Simulator(StateArrays):
             raise UsageError("a touch stop needs a scene with pads")
         reads = arguments.integers("read_after", read_after)
         steps, n = controls.shape[0], self.num_envs
+        rows = 1 if arguments.flag("end_only", end_only) else steps + 1
         reading = (self.model.num_markers, 3) if reduction is None else (len(reduction.names),)
         tactile_shape = (len(reads), n, *reading)
         if out is not None:
-            out.check_reusable(controls.shape, tactile_shape)
+            out.check_reusable(controls.shape, rows, tactile_shape)
         mask = self._mask("active", active)
 
         empty = np.empty if mask is None else np.zeros
         start = {"q": q, "v": v, "anchors": anchors, "anchored": anchored, "history": history}
         result = Trajectory(
-            **{name: self._along_time(name, value, steps, out) for name, value in start.items()},
+            **{name: state_rows(name, value, getattr(self, name), rows, out) for name, value in start.items()},
             u=controls,
             tactile=out.tactile if out is not None else empty(tactile_shape, self.dtype),
             read_after=reads,
@@ -335,23 +338,13 @@ class Simulator(StateArrays):
         checked(self._batch.rollout, result.core(), None if stop is None else stop.core(n, steps))
         return result
 
-    def _along_time(self, name: str, start: ArrayLike | None, steps: int, out: Trajectory | None) -> NDArray[Any]:
-        """A part of the state over a rollout, in a new array or that of `out`, with its initial value."""
-        present = getattr(self, name)
-        shape = (steps + 1, *present.shape)
-        array = np.zeros(shape, present.dtype) if out is None else out.reused(name, shape, present.dtype)
-        fill(name, array[0], present if start is None else start)  # before: it may be the end of `out`
-        if out is not None and name == "anchors":
-            array[1:] = 0  # the core writes only the anchors that are set
-        return array
-
     def contact_modes(self, trajectory: Trajectory) -> NDArray[np.uint64]:
         """Contact mode signature of each step (contact, slip and clipping of every point and actuator), (steps, N).
 
         Two rollouts with equal signatures lie on the same smooth piece of the dynamics. Markers are included in steps
         after which they were read.
         """
-        arguments.check_type("trajectory", trajectory, Trajectory, "a Trajectory")
+        check_complete(trajectory)
         return np.asarray(checked(self._batch.contact_modes, trajectory.core()))
 
     def rollout_gradient(
@@ -377,7 +370,7 @@ class Simulator(StateArrays):
         The simulator must have the parameters of the rollout. An environment that stopped is differentiated as the
         steps that it took: the number of steps is a constant. Failed environments have gradient zero.
         """
-        arguments.check_type("trajectory", trajectory, Trajectory, "a Trajectory")
+        check_complete(trajectory)
 
         def shaped(value: ArrayLike | None, like: NDArray[Any]) -> NDArray[Any]:
             if value is None:

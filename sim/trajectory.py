@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gelflow.errors import UsageError
 from gelflow.sim import _core
-from gelflow.sim.arguments import integer, number_array
+from gelflow.sim.arguments import check_type, fill, integer, number_array
 from gelflow.sim.reductions import TactileReduction
 
 
@@ -49,7 +49,8 @@ class Trajectory:
     """A recorded rollout of N environments. The first axis is time, the second the environment.
 
     Sizes: nq positions, nv velocities, nu controls, na friction anchors, nh values of the BDF2 history. The state of an
-    environment that stopped, failed or rested repeats in all later steps.
+    environment that stopped, failed or rested repeats in all later steps. With `end_only` the states have a single row,
+    the end of the rollout.
     """
 
     q: NDArray[Any]  # (steps + 1, N, nq)
@@ -71,13 +72,15 @@ class Trajectory:
         reduction = None if self.reduction is None else self.reduction.core
         return _core.Trajectory(**{**vars(self), "reduction": reduction})
 
-    def check_reusable(self, u_shape: tuple[int, ...], tactile_shape: tuple[int, ...]) -> None:
-        """Raises UsageError unless the arrays can hold another rollout with these shapes."""
+    def check_reusable(self, u_shape: tuple[int, ...], rows: int, tactile_shape: tuple[int, ...]) -> None:
+        """Raises UsageError unless the arrays can hold another rollout with these shapes, and `rows` states."""
         if self.u.shape != u_shape or len(self.read_after) != tactile_shape[0]:
             raise UsageError(
                 f"out must be a trajectory with u of shape {u_shape} and {tactile_shape[0]} tactile readings, "
                 f"got {self.u.shape} and {len(self.read_after)}"
             )
+        if len(self.q) != rows:
+            raise UsageError(f"out must have {rows} states (see end_only), got {len(self.q)}")
         if self.tactile.shape != tactile_shape:
             raise UsageError(
                 f"out must have tactile readings of shape {tactile_shape} (see reduction), got {self.tactile.shape}"
@@ -90,6 +93,28 @@ class Trajectory:
             expected = f"{np.dtype(dtype)} {shape}"
             raise UsageError(f"out is of another model: its {name} is {array.dtype} {array.shape}, not {expected}")
         return array
+
+
+def check_complete(trajectory: Trajectory) -> None:
+    """Raises UsageError unless `trajectory` is a Trajectory with the states of all steps."""
+    check_type("trajectory", trajectory, Trajectory, "a Trajectory")
+    if len(trajectory.q) <= len(trajectory.u):
+        raise UsageError("the trajectory has its last state only; repeat the rollout without end_only")
+
+
+def state_rows(
+    name: str, start: ArrayLike | None, present: NDArray[Any], rows: int, out: Trajectory | None
+) -> NDArray[Any]:
+    """A part of the state for a rollout, (rows, *shape of `present`): a new array or that of `out`.
+
+    The first row is the initial value: `start`, or without it the present one.
+    """
+    shape = (rows, *present.shape)
+    array = np.zeros(shape, present.dtype) if out is None else out.reused(name, shape, present.dtype)
+    fill(name, array[0], present if start is None else start)  # before: it may be the end of `out`
+    if out is not None and name == "anchors":
+        array[1:] = 0  # the core writes only the anchors that are set
+    return array
 
 
 @dataclass(frozen=True, eq=False)

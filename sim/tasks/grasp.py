@@ -296,6 +296,7 @@ class Grasp(AttemptTask):
             q=full,
             read_after=(close, total),
             active=np.arange(sim.num_envs) < count,
+            end_only=True,
             out=self._rollout,
         )
         end = trajectory.q[-1, :count]

@@ -257,6 +257,7 @@ class InsertionAttempts:
             read_after=steps,
             active=np.arange(sim.num_envs) < n,
             stop=TouchStop(threshold, reference_step=self._reference_at) if can_stop else None,
+            end_only=True,
             out=self._trajectory,
         )
         for name, values in self._end.items():

@@ -36,7 +36,7 @@ void Batch<T>::rollout_one(const Trajectory<T>& r, const TouchStop* stop, int en
     }
     if (t == r.steps || interruption_->check(thread)) break;
     const StateView<T> next = r.state(m, t + 1, e, q_rounding);
-    copy_state<T>(m, now, next);
+    if (!r.end_only) copy_state<T>(m, now, next);
     if (!moving) continue;
     const StepReport report = gelflow::step<T>(m, params_of(env), r.controls(m, t, e), m.polish, next, memory, t > 0);
     r.status[e] = static_cast<std::int32_t>(report.status);
@@ -55,7 +55,7 @@ void Batch<T>::rollout(const Trajectory<T>& r, const TouchStop* stop) {
   for (int e = 0; e < n; ++e) {
     r.status[e] = 0;
     r.stopped_at[e] = -1;
-    if (r.active[e] != 0) continue;
+    if (r.active[e] != 0 || r.end_only) continue;
     for (int t = 0; t < r.steps; ++t) copy_state<T>(*model, r.state(*model, t, e), r.state(*model, t + 1, e));
   }
   for_active(r.active, [&](int env, int thread) { rollout_one(r, stop, env, thread); });

@@ -10,10 +10,11 @@ namespace gelflow {
 template <class T>
 struct Trajectory {
   int steps, reads, environments;
+  bool end_only;                      // the states have one row: that of the last step taken so far
   const T* u;                         // (steps, N, nu)
-  T *q, *v, *anchors;                 // (steps + 1, N, ·); the first entry is the initial state
-  T* history;                         // (steps + 1, N, nh)
-  std::uint8_t* anchored;             // (steps + 1, N, na)
+  T *q, *v, *anchors;                 // (steps + 1, N, ·) or (1, N, ·); the first entry is the initial state
+  T* history;                         // (steps + 1 or 1, N, nh)
+  std::uint8_t* anchored;             // (steps + 1 or 1, N, na)
   std::int8_t* halvings;              // (steps, N)
   std::int32_t* status;               // (N): a Status
   const std::uint8_t* active;         // (N): 0 where the environment rests: no step and no reading
@@ -25,7 +26,7 @@ struct Trajectory {
   // Row of an environment after `step` steps, in arrays with one row per step and environment.
   std::size_t row(int step, std::size_t e) const { return static_cast<std::size_t>(step) * environments + e; }
   StateView<T> state(const Model& m, int step, std::size_t e, T* q_rounding = nullptr) const {
-    const std::size_t i = row(step, e);
+    const std::size_t i = row(end_only ? 0 : step, e);
     return {q + i * m.nq,        v + i * m.nv,       reinterpret_cast<V3<T>*>(anchors) + i * m.na,
             anchored + i * m.na, history + i * m.nh, q_rounding};
   }

@@ -98,16 +98,15 @@ Trajectory<T> checked(const Batch<T>& b, TrajectoryArrays& t, bool written) {
       throw std::invalid_argument("read_after must increase and lie between 0 and the number of steps");
     }
   }
-  Trajectory<T> r{};
-  r.steps = static_cast<int>(steps);
-  r.reads = static_cast<int>(reads);
-  r.environments = b.n;
+  Trajectory<T> r{.steps = static_cast<int>(steps), .reads = static_cast<int>(reads), .environments = b.n};
+  r.end_only = written && steps > 0 && t.q.ndim() > 0 && t.q.shape(0) == 1;
+  const py::ssize_t rows = r.end_only ? 1 : steps + 1;
   r.u = readable<T>(t.u, {steps, n, actuators(b)}, "u");
-  r.q = memory_of<T>(t.q, {steps + 1, n, m.nq}, "q", written);
-  r.v = memory_of<T>(t.v, {steps + 1, n, m.nv}, "v", written);
-  r.anchors = memory_of<T>(t.anchors, {steps + 1, n, m.na, 3}, "anchors", written);
-  r.anchored = memory_of<std::uint8_t>(t.anchored, {steps + 1, n, m.na}, "anchored", written);
-  r.history = memory_of<T>(t.history, {steps + 1, n, m.nh}, "history", written);
+  r.q = memory_of<T>(t.q, {rows, n, m.nq}, "q", written);
+  r.v = memory_of<T>(t.v, {rows, n, m.nv}, "v", written);
+  r.anchors = memory_of<T>(t.anchors, {rows, n, m.na, 3}, "anchors", written);
+  r.anchored = memory_of<std::uint8_t>(t.anchored, {rows, n, m.na}, "anchored", written);
+  r.history = memory_of<T>(t.history, {rows, n, m.nh}, "history", written);
   r.halvings = memory_of<std::int8_t>(t.halvings, {steps, n}, "halvings", written);
   r.status = memory_of<std::int32_t>(t.status, {n}, "status", written);
   r.active = readable<std::uint8_t>(t.active, {n}, "active");
