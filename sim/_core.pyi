@@ -507,7 +507,10 @@ class TouchStop:
     def after_step(self) -> int: ...  # evaluated after this step and all later ones
 
 class Trajectory:
-    """The arrays of a rollout, without copies: C-contiguous, time first, then environment."""
+    """The arrays of a rollout, without copies: C-contiguous, time first, then environment.
+
+    A rollout into states of one row, instead of steps + 1, leaves its last state there.
+    """
 
     def __init__(
         self,

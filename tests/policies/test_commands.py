@@ -172,3 +172,7 @@ def test_fine_tuning_starts_from_the_shipped_policy_of_the_part(part: list[str],
     shipped = default_checkpoint().with_name(f"{name}.safetensors")
     assert stored["configuration"]["start"] == load_checkpoint(shipped).digest
     assert stored["configuration"]["recipe"] == "fine-tuning" and str(shipped) in stored["command"]
+    trained, task = load_checkpoint(tmp_path / "run" / "insertion.safetensors").task, stored["configuration"]["task"]
+    *_, start_yaw = task["misalignment"]
+    *_, yaw = trained["misalignment"]
+    assert start_yaw == pytest.approx(1.3 * yaw), "the policy is for the task, whatever the starts of its training"

@@ -28,6 +28,7 @@ from gelflow.sim.tasks.insertion_environments import Insertion
 from gelflow.sim.tasks.parts import load_part
 from gelflow.sim.tasks.randomization import Uniform
 from gelflow.sim.tasks.registry import make_task, task_names
+from gelflow.task import INSERTION
 
 
 class Direct(OraclePolicy):
@@ -55,6 +56,24 @@ def test_the_help_of_train_states_the_default_steps(
                 others.setdefault(count, []).append(name)
         listed = "".join(f", with --recipe {' or '.join(names)} {count}" for count, names in others.items())
         assert re.search(re.escape(f"{task} {steps[task]}{listed}") + "[;)]", text)
+
+
+@pytest.mark.parametrize(
+    ("misalignment", "wider"),
+    [((6e-3, 5e-3, 0.1), (6e-3, 5e-3, 0.13)), ((6e-3, 6e-3, 0.25), (6e-3, 6e-3, np.pi / 12)), ((1e-3, 0, 0),) * 2],
+)
+def test_a_fine_tuning_starts_with_more_yaw_than_the_task(
+    misalignment: tuple[float, float, float], wider: tuple[float, float, float]
+) -> None:
+    """Within the workspace."""
+    task = dataclasses.replace(INSERTION, misalignment=misalignment)
+    recipe = recipe_for("insertion", "fine-tuning")
+    trained = recipe.make_training_task(2, task=task).description
+    assert trained.misalignment == pytest.approx(wider)
+    assert dataclasses.replace(trained, misalignment=misalignment) == task
+    assert recipe.make_task(2, task=task).description == task
+    for name in ("default", "ppo"):
+        assert recipe_for("insertion", name).make_training_task(2, task=task).description == task
 
 
 @pytest.mark.parametrize("task", task_names())

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 _DEFAULT = "imitation"
 _SHIPPED = Path("shipped")  # --start without a file
 _STEPS = (
-    "environment steps in total, for the insertion attempts (default: insertion 400000, with --start 150000, with "
+    "environment steps in total, for the insertion attempts (default: insertion 400000, with --start 60000, with "
     "--algorithm ppo 200000; grasp 20480; cap 400000, with --recipe published or published-no-touch 2400000; "
     "pushing 480000)"
 )
