@@ -321,7 +321,6 @@ class Simulator(StateArrays):
         if out is not None:
             out.check_reusable(controls.shape, rows, tactile_shape)
         mask = self._mask("active", active)
-
         empty = np.empty if mask is None else np.zeros
         start = {"q": q, "v": v, "anchors": anchors, "anchored": anchored, "history": history}
         result = Trajectory(

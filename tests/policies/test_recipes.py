@@ -28,7 +28,7 @@ from gelflow.sim.tasks.insertion_environments import Insertion
 from gelflow.sim.tasks.parts import load_part
 from gelflow.sim.tasks.randomization import Uniform
 from gelflow.sim.tasks.registry import make_task, task_names
-from gelflow.task import INSERTION
+from gelflow.task import INSERTION, InsertionTask
 
 
 class Direct(OraclePolicy):
@@ -69,7 +69,7 @@ def test_a_fine_tuning_starts_with_more_yaw_than_the_task(
     task = dataclasses.replace(INSERTION, misalignment=misalignment)
     recipe = recipe_for("insertion", "fine-tuning")
     trained = recipe.make_training_task(2, task=task).description
-    assert trained.misalignment == pytest.approx(wider)
+    assert isinstance(trained, InsertionTask) and trained.misalignment == pytest.approx(wider)
     assert dataclasses.replace(trained, misalignment=misalignment) == task
     assert recipe.make_task(2, task=task).description == task
     for name in ("default", "ppo"):
