@@ -29,6 +29,15 @@ def add_out(parser: argparse.ArgumentParser, text: str, *, default: Path | None 
     parser.add_argument("--out", type=Path, default=default, metavar="DIR" if folder else "FILE", help=text + shown)
 
 
+def is_taken(file: Path) -> bool:
+    """Whether a file, folder or link has this name. Raises OSError for a name that is too long."""
+    try:
+        file.lstat()
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    return True
+
+
 def check_new_file(file: Path, *, suffixes: tuple[str, ...] = ()) -> None:
     """Raise UsageError where no new file can be `file`: it exists, its folder does not, or its suffix is another one.
 
@@ -36,7 +45,7 @@ def check_new_file(file: Path, *, suffixes: tuple[str, ...] = ()) -> None:
     """
     if suffixes and file.suffix.lower() not in suffixes:
         raise UsageError(f"--out {file}: the suffix must be one of {', '.join(suffixes)}")
-    if os.path.lexists(file):
+    if is_taken(file):
         raise UsageError(f"{file} exists; name a new file with --out")
     if not file.parent.is_dir():
         raise UsageError(f"{file}: the folder {file.parent} does not exist")

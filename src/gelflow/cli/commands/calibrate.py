@@ -19,6 +19,7 @@ from gelflow.cli.options import (
     add_quick,
     add_seed,
     check_at_least,
+    is_taken,
     part_task,
     removed_on_error,
 )
@@ -98,7 +99,7 @@ def run(args: argparse.Namespace) -> int:
         return SUCCESS
     files = [args.out / "report.json", args.out / "report.html", args.out / SCENE, args.out / MODEL]
     for file in files:
-        if os.path.lexists(file):
+        if is_taken(file):
             raise UsageError(f"{file} exists; name a new folder with --out")
         if args.plan is not None and args.plan.resolve() == file.resolve():
             raise UsageError(f"--plan {args.plan} is a file of the report; give the plan another name")
@@ -167,7 +168,7 @@ def _check(args: argparse.Namespace) -> None:
         raise UsageError("--lab gives the limits of --plan; name the plan file, or leave --lab out")
     if not args.sessions and args.quick:
         raise UsageError("--quick is for the fit of a SESSION; leave it out")
-    if args.plan is not None and os.path.lexists(args.plan):
+    if args.plan is not None and is_taken(args.plan):
         raise UsageError(f"{args.plan} exists; name a new file with --plan")
 
 
