@@ -152,7 +152,7 @@ def fit(
         except BrokenExecutor as error:
             raise SimulationError(
                 "a process of the fit was killed, as the system does when memory is short; close other programs, or "
-                'calibrate fewer sessions at a time; a script calls calibrate below if __name__ == "__main__":'
+                'calibrate fewer sessions at a time. A script must call calibrate under if __name__ == "__main__"'
             ) from error
     ended = sorted((result for result in results if result is not None), key=lambda result: result.cost)
     if not ended:

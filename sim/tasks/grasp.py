@@ -29,7 +29,6 @@ from gelflow.sim.tasks.task_batch import (
     check_options,
     option_rows,
 )
-from gelflow.sim.trajectory import Trajectory
 from gelflow.task import TaskDescription
 
 _CHUNK = 64  # environments of one rollout: bounds the memory of its trajectory
@@ -159,7 +158,6 @@ class Grasp(AttemptTask):
         self._lifted = {  # state at the end of the last attempt
             name: np.repeat(getattr(self.sim, name)[:1], num_envs, axis=0) for name in ("q", "v", "anchors", "anchored")
         }
-        self._rollout: Trajectory | None = None
         self._steps = tuple(
             max(1, round(time / self.scene.step)) for time in (task.close_time, task.lift_time, task.hold_time)
         )
@@ -291,13 +289,12 @@ class Grasp(AttemptTask):
         full[:count] = q
         close, total = self._steps[0], sum(self._steps)
         sim.reset()
-        self._rollout = trajectory = sim.rollout(
+        trajectory = sim.rollout(
             self._controls(rows),
             q=full,
             read_after=(close, total),
             active=np.arange(sim.num_envs) < count,
             end_only=True,
-            out=self._rollout,
         )
         end = trajectory.q[-1, :count]
         for name, values in self._lifted.items():

@@ -148,7 +148,6 @@ class InsertionAttempts:
         self._end = {name: np.repeat(getattr(self.sim, name)[:1], num_envs, axis=0) for name in _STATE}
         self._not_grasped: Mask = np.zeros(num_envs, bool)  # the closing of the gripper could not be simulated
         self._grasp_shear: Array = np.zeros((num_envs, self.scene.num_markers, 2))
-        self._trajectory: Trajectory | None = None
 
     def _step_at(self, depth: float) -> int:
         """Number of steps after which the gripper's target is `depth` [m] below its start."""
@@ -252,13 +251,12 @@ class InsertionAttempts:
         threshold = np.full(sim.num_envs, np.inf)
         threshold[:n] = self.stop_shear[rows]
         can_stop = self._reference_at < self._steps
-        self._trajectory = trajectory = sim.rollout(
+        trajectory = sim.rollout(
             u,
             read_after=steps,
             active=np.arange(sim.num_envs) < n,
             stop=TouchStop(threshold, reference_step=self._reference_at) if can_stop else None,
             end_only=True,
-            out=self._trajectory,
         )
         for name, values in self._end.items():
             getattr(sim, name)[:] = getattr(trajectory, name)[-1]
