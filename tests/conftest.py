@@ -12,9 +12,13 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 for _library in ("OMP", "OPENBLAS", "MKL"):
     os.environ.setdefault(f"{_library}_NUM_THREADS", "1")
 
-# A shell ignores SIGINT for background jobs, nohup ignores SIGHUP, and child processes inherit that: tests of signals
-# need the defaults.
-for _number, _handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
+# A shell ignores SIGINT and SIGQUIT for background jobs, nohup ignores SIGHUP, and child processes inherit that: tests
+# of signals need the defaults.
+for _number, _handler in (
+    (signal.SIGINT, signal.default_int_handler),
+    (signal.SIGHUP, signal.SIG_DFL),
+    (signal.SIGQUIT, signal.SIG_DFL),
+):
     if signal.getsignal(_number) == signal.SIG_IGN:
         signal.signal(_number, _handler)
 
