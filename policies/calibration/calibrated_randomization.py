@@ -24,6 +24,7 @@ from gelflow.task import InsertionTask
 Array = NDArray[np.float64]
 
 SAMPLES = 256
+_DRAWS = 64 * SAMPLES  # of which those within the limit are used
 _LIMIT = 3**0.5  # of a whitened parameter [sd]: three times the range of a randomization that is the prior
 _NOISE = 2.0  # factor by which the estimate of the noise may be wrong
 _DIGITS = 5  # significant
@@ -56,10 +57,9 @@ def _samples(result: Calibration, rng: np.random.Generator) -> dict[str, Array]:
     """
     confirmed = {e.parameter.name for e in result.estimates if e.confirmed}
     fitted = result.parameters
-    points = result.fit.draw(rng, SAMPLES)
     of_table = [p.name in QUANTITIES and not p.name.startswith("grasp") for p in fitted]
-    limit = np.where(of_table, _LIMIT, np.abs(points.mean(0)) + _LIMIT)
-    points = np.clip(points, -limit, limit)
+    mean = result.fit.joint_distribution[0]
+    points = _within(np.where(of_table, _LIMIT, np.abs(mean) + _LIMIT), result.fit.draw(rng, _DRAWS))
     values = {p.name: p.value(points[:, i]) for i, p in enumerate(fitted)}
     ratio, direction = gain_ratio(fitted)
     values[ratio.name] = ratio.value(points @ direction)
@@ -70,6 +70,15 @@ def _samples(result: Calibration, rng: np.random.Generator) -> dict[str, Array]:
     pads = ReadingModel(recordings, threads=1).pads
     values["crosstalk"] = pads.crosstalk_on_grid(values["crosstalk"], flow, recordings.used)
     return {name: values[name] for name in DEFAULT_RANDOMIZATION if name in values and name in confirmed}
+
+
+def _within(limit: Array, points: Array) -> Array:
+    """The first `SAMPLES` of the points (n, parameters) that are within ± `limit` (parameters,).
+
+    Where there are fewer, the nearest other points are moved to the limit, which changes combinations of parameters.
+    """
+    beyond = np.maximum(np.abs(points) - limit, 0.0).max(1)
+    return np.clip(points[np.argsort(beyond, kind="stable")[:SAMPLES]], -limit, limit)
 
 
 def _rounded(values: Array) -> list[float]:
@@ -115,7 +124,7 @@ def read_randomization(path: Path, task: InsertionTask) -> dict[str, Any]:
 def _why_nothing(flow_maps: Any) -> str:
     """Why a report with these results for its flow maps has no samples."""
     if not flow_maps.get("converged", True):
-        return "the searches of the fit do not agree"
+        return "the starts of the fit do not agree"
     if not flow_maps.get("reproduced", True):
         return "the simulation with the fitted parameters does not reproduce the recordings"
     return "the recordings determine nothing about the randomization"

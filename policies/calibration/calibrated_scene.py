@@ -24,7 +24,7 @@ _HEADING = (
 def write_scene(result: Calibration, folder: Path) -> list[Path]:
     """Write `scene.toml` and its model with the values of the known and partly known parameters; returns the files.
 
-    Writes nothing when no parameter of the scene is known. Raises OSError.
+    Writes nothing when no parameter of the scene is known. Raises OSError, also where one of the files exists.
     """
     known = {
         e.parameter.name: e.value
@@ -39,9 +39,14 @@ def write_scene(result: Calibration, folder: Path) -> list[Path]:
     for name, value in changed.items():
         _set(tables, name, value)
     tables["model"] = MODEL
-    (folder / SCENE).write_text(_HEADING.format(names=", ".join(known)) + toml_text(tables), "utf-8")
-    (folder / MODEL).write_text(_model(shipped.with_name(MODEL), changed), "utf-8")
-    return [folder / SCENE, folder / MODEL]
+    scene, model = folder / SCENE, folder / MODEL
+    for file, text in (
+        (scene, _HEADING.format(names=", ".join(known)) + toml_text(tables)),
+        (model, _model(shipped.with_name(MODEL), changed)),
+    ):
+        with file.open("x", encoding="utf-8") as out:
+            out.write(text)
+    return [scene, model]
 
 
 def _changed_parameters(known: Mapping[str, float]) -> dict[str, float]:

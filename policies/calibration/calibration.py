@@ -10,6 +10,7 @@ from gelflow.policies.calibration.comparison import error
 from gelflow.policies.calibration.fit import FitResult, FitSettings, fit
 from gelflow.policies.calibration.model.parameters import Parameter, gain_ratio
 from gelflow.policies.calibration.model.shear_model import QUANTITIES
+from gelflow.policies.calibration.planning.information import Known
 from gelflow.policies.calibration.planning.suggestions import Suggestion, suggest
 from gelflow.policies.calibration.pose_search import find_poses
 from gelflow.policies.calibration.problem import Problem
@@ -108,6 +109,11 @@ class Calibration:
         return _predicted(self.held_out_residual)
 
     @property
+    def known(self) -> Known | None:
+        """What plans may assume about the parameters; None: the priors, because the fit is not good enough."""
+        return _known(self.parameters, self.fit, predicted=self.predicted is not False)
+
+    @property
     def explained(self) -> bool | None:
         """Whether the errors of held-out flow maps are at most `ALLOWED_ERROR` times the noise; None: none held out."""
         maps = self.held_out
@@ -168,14 +174,15 @@ def calibrate(
         other.allow_for(drift=result.best.drift)
         found = find_poses(other, point, rng)
         held_out, residual = _flow_maps(other, found, rng), other.errors.chi(other.residuals(*found)[0])
+    predicted = _predicted(residual) is not False
     return Calibration(
-        _estimates(problem.fitted, result, predicted=_predicted(residual) is not False),
+        _estimates(problem.fitted, result, predicted=predicted),
         _pairs(problem.fitted, result),
         _flow_maps(problem, (result.best.point, result.best.misalignment), rng),
         held_out,
         residual,
         recordings,
-        tuple(suggest(problem, result)),
+        tuple(suggest(problem, _known(problem.fitted, result, predicted=predicted))),
         result,
     )
 
@@ -210,6 +217,18 @@ def _estimates(fitted: tuple[Parameter, ...], result: FitResult, *, predicted: b
         )
         for i, p in enumerate((*fitted, ratio))
     )
+
+
+def _known(fitted: tuple[Parameter, ...], result: FitResult, *, predicted: bool) -> Known | None:
+    """The joint distribution of the parameters that are confirmed, with the priors of the others; None: of all."""
+    if not (result.converged and _reproduced(result)):
+        return None
+    mean, covariance = result.joint_distribution
+    if not predicted:
+        unknown = np.array([p.name in QUANTITIES for p in fitted])
+        mean = np.where(unknown, 0.0, mean)
+        covariance = np.where(unknown[:, None] | unknown, np.eye(len(fitted)), covariance)
+    return Known(mean, covariance, result.best.drift)
 
 
 def _pairs(fitted: tuple[Parameter, ...], result: FitResult) -> tuple[tuple[str, str, float], ...]:

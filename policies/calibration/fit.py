@@ -90,7 +90,7 @@ class FitResult:
         """
         points = np.stack([start.point[: self.count] for start in self.starts])
         between = points - points.mean(0)
-        variances, axes = np.linalg.eigh(self.covariance + between.T @ between / len(points))
+        variances, axes = np.linalg.eigh(self.covariance + between.T @ between / max(1, len(points) - 1))
         return points.mean(0), np.asarray((axes * np.clip(variances, 0.0, 1.0)) @ axes.T)
 
     def draw(self, rng: np.random.Generator, count: int) -> Array:

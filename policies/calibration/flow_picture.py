@@ -50,5 +50,6 @@ def draw_flow_maps(
             add_arrows(axis, grid, red.T, color=VERMILION, width=0.004)
             axis.set_title(f"{SIDES[side]} pad" + (f", {title}" if title else ""), fontsize=8)
         line[0].set_ylabel(f"{names[i]}\nlongest arrow {longest:.3g} {unit}", fontsize=8)
-    figure.supxlabel(f"{note}blue: recorded, red: simulated; fingertip down", fontsize=8)
+    shown = f"first {count} of {len(recorded)} attempts; " if count < len(recorded) else ""
+    figure.supxlabel(f"{shown}{note}blue: recorded, red: simulated; fingertip down", fontsize=8)
     return figure

@@ -15,7 +15,6 @@ from gelflow.task import InsertionTask
 Array = NDArray[np.float64]
 
 MODEL_ERROR = 0.02  # of a flow map that the model is not expected to reproduce, relative to its root mean square
-_MEDIAN_SIZE = 0.6745  # of a normal distribution, relative to its standard deviation
 _NOISY = 1.5  # median distance of a noisy marker from the range of its neighbours, relative to noise and model error
 
 
@@ -77,22 +76,21 @@ class Recordings:
         )
 
     def noise(self) -> float:
-        """Standard deviation of the difference of two readings of a marker, in `unit`.
+        """Standard deviation of the difference of two readings of a marker, in `unit`: root mean square of both pads.
 
-        From the second differences of the flow maps across rows and columns, in which smooth fields cancel. The median
-        over the measured markers of a pad ignores the edges of contacts; the lower quartile over attempts and pads
+        From the second differences of the flow maps across rows and columns, in which smooth fields cancel. The lower
+        quartile over the measured markers of a pad ignores the edges of contacts; the lower quartile over the attempts
         ignores the maps of firm contacts, which are not smooth.
         """
         if self.given_noise is not None:
             return self.given_noise
         differences = np.abs(_second_differences(self.flow))
-        whole = self._measured_neighbourhoods()
-        roughness = [self._roughness(of_pad) for of_pad in whole]
-        sizes = [
-            np.median(differences[:, pad, of_pad].reshape(len(self.flow), -1), axis=1) * (roughness[0] / roughness[pad])
-            for pad, of_pad in enumerate(whole)
-        ]
-        return float(np.quantile(sizes, 0.25) / _MEDIAN_SIZE / roughness[0])
+        spread = self._second_difference_spread()
+        of_pads = []
+        for pad, where in enumerate(self._measured_neighbourhoods() & (spread > 1e-6)):
+            sizes = np.quantile(differences[:, pad, where].reshape(len(self.flow), -1), 0.25, axis=1)
+            of_pads.append(np.quantile(sizes, 0.25) / _lower_quartile(spread[where]))
+        return float(np.sqrt(np.mean(np.square(of_pads))))
 
     def _measured_neighbourhoods(self) -> NDArray[np.bool_]:
         """Where a marker and its eight neighbours are measured, (pads, rows - 2, cols - 2); on a pad without: all."""
@@ -101,21 +99,19 @@ class Recordings:
         whole = squares.all((3, 4))
         return np.asarray(np.where(np.any(whole, axis=(1, 2), keepdims=True), whole, True))
 
-    def _roughness(self, where: NDArray[np.bool_]) -> float:
-        """Standard deviation of the second differences of markers whose noise has standard deviation 1.
+    def _second_difference_spread(self) -> Array:
+        """Standard deviations (rows - 2, cols - 2) of the second differences, of noise with standard deviation 1.
 
         Markers that are interpolated between printed ones share part of their noise, so their second differences have
-        different spreads: the value is that of a normal distribution with the same median magnitude `where` (rows - 2,
-        cols - 2) the neighbourhood of a marker is measured.
+        different spreads: 0 where all neighbours are copies of one printed marker.
         """
         grid = self.task.grid
         if self.printed is None or self.printed == grid:
-            return 6.0
+            return np.full((grid.rows - 2, grid.cols - 2), 6.0)
         weights = resampling_weights(self.printed.positions(), grid)
         fields = np.moveaxis(weights.reshape(grid.rows, grid.cols, -1), 2, 0)[:, None, :, :, None]
-        spread = np.sqrt((_second_differences(fields) ** 2).sum(0))[0, where].reshape(-1, 1)
-        sizes = spread * np.abs(scipy.special.ndtri((np.arange(400) + 0.5) / 400))
-        return float(np.median(sizes) / _MEDIAN_SIZE / np.sqrt((weights**2).sum(1).mean()))
+        spread = np.sqrt((_second_differences(fields) ** 2).sum(0))[0, ..., 0]
+        return np.asarray(spread / np.sqrt((weights**2).sum(1).mean()))
 
     def stop_shear(self) -> tuple[float, float] | None:
         """Range of the shear along a finger at which descents stopped, in `unit`; None: all were motions of a plan.
@@ -145,6 +141,11 @@ class Recordings:
         expected = np.sqrt(self.noise() ** 2 + MODEL_ERROR**2 * size + 1e-30)
         beyond = np.maximum(self.flow - np.nanmax(near, axis=0), np.nanmin(near, axis=0) - self.flow)
         return np.asarray(np.median(beyond / expected[:, None, None, None, None], axis=(0, 4)) > _NOISY).reshape(-1)
+
+
+def _lower_quartile(spread: Array) -> float:
+    """Lower quartile of the magnitudes of values from normal distributions with standard deviations `spread` (n,)."""
+    return float(np.quantile(spread[:, None] * np.abs(scipy.special.ndtri((np.arange(400) + 0.5) / 400)), 0.25))
 
 
 def _second_differences(flow: Array) -> Array:

@@ -35,7 +35,7 @@ def plain_report(result: Calibration, sessions: Sequence[Path]) -> dict[str, Any
             "unit": result.unit,
             "noise": result.noise,
             "height_offset": result.height_offset,
-            "noisy_markers": int((~result.fitted.used).sum()),
+            "unused_markers": int((~result.fitted.used).sum()),
             "fitted": _errors(result.fitted),
             "held_out": None if held_out is None else _errors(held_out),
             "explained": result.explained,
@@ -155,8 +155,8 @@ def error_lines(result: Calibration) -> list[str]:
     if not result.converged:
         used = len(result.fit.starts)
         lines.append(
-            f"{used} of {used + result.fit.others} searches found this fit, the others worse ones: another could be "
-            "better still, and no parameter counts as known; record more attempts, or try another --seed"
+            f"only {used} of {used + result.fit.others} starts of the fit reached this residual, so a better fit may "
+            "exist; no parameter counts as known: record more attempts, or repeat with another --seed"
         )
     if result.predicted is False:
         lines.append(

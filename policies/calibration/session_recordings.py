@@ -55,7 +55,8 @@ def read_recordings(
                 visible = visible_markers(described)
             setup = setup or present
             present.check(path, setup, paths[0])
-            found, entered = _attempts(path, session, number, present.task)
+            name = f"{path.stem}, " if len(paths) > 1 else ""
+            found, entered = _attempts(path, session, number, name, present.task)
         planned += [described.get("checkpoint") is None] * len(found)
         rows += found
         inserted |= entered
@@ -82,21 +83,26 @@ def read_recordings(
         grasp_height=setup.grasp_height,
         planned=np.array(planned),
         height_spread=_HEIGHT,
-        measured=_measured(setup, visible),
+        measured=_measured(setup.task, setup.printed, visible),
     )
 
 
-def _measured(setup: "_Setup", visible: Sequence[NDArray[np.bool_]]) -> NDArray[np.bool_]:
+def _measured(task: InsertionTask, printed: Grid | None, visible: Sequence[NDArray[np.bool_]]) -> NDArray[np.bool_]:
     """Markers of the flow maps whose values come from visible printed markers only, (pads * rows * cols,)."""
-    grid = setup.task.grid
+    grid = task.grid
     if not visible:
-        return np.ones(setup.task.sensors * grid.rows * grid.cols, dtype=bool)
-    weights = resampling_weights((setup.printed or grid).positions(), grid)
+        return np.ones(task.sensors * grid.rows * grid.cols, dtype=bool)
+    weights = resampling_weights((printed or grid).positions(), grid)
     return np.concatenate([~(np.abs(weights[:, ~shown]) > 1e-9).any(1) for shown in visible])
 
 
 def nothing_recorded(
-    task: InsertionTask, *, grasp_force: float | None, grasp_height: float | None, printed: Grid | None = None
+    task: InsertionTask,
+    *,
+    grasp_force: float | None,
+    grasp_height: float | None,
+    printed: Grid | None = None,
+    visible: Sequence[NDArray[np.bool_]] = (),
 ) -> Recordings:
     """Recordings of a lab without an attempt, for a plan.
 
@@ -105,11 +111,13 @@ def nothing_recorded(
     grasp_force: commanded [N]; None: any of the randomization
     grasp_height: of the pad centres above the part's centre [m]; None: any of the randomization
     printed: the markers on each gel; None: those of the task
+    visible: which printed markers of each pad its camera shows, (markers,) each; empty: all
     """
     flow = np.zeros((0, task.sensors, task.grid.rows, task.grid.cols, 2))
     return Recordings(
         task, np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros(0), flow, "mm", (),
         settle=AT_REST, printed=printed, grasp_force=grasp_force, grasp_height=grasp_height, height_spread=_HEIGHT,
+        measured=_measured(task, printed, visible),
     )  # fmt: skip
 
 
@@ -179,9 +187,12 @@ def _task(path: Path, described: dict[str, Any], part: Part | None) -> Insertion
 
 
 def _attempts(
-    path: Path, session: SessionReader, first: int, task: InsertionTask
+    path: Path, session: SessionReader, first: int, prefix: str, task: InsertionTask
 ) -> tuple[list[dict[str, Any]], dict[int, np.ndarray[Any, Any]]]:
-    """Attempts with contact, and planar poses of inserted parts, by insertion counted from `first`."""
+    """Attempts with contact, and planar poses of inserted parts, by insertion counted from `first`.
+
+    Names are those of the session itself, after `prefix`.
+    """
     decisions: dict[tuple[int, int], Decision] = {}
     rows, inserted = [], {}
     for record in session.records(["/decision", "/attempt"]):
@@ -196,7 +207,7 @@ def _attempts(
             planar, depth = np.array(value["planar_pose"], dtype=float), float(value["depth"])
         except (TypeError, ValueError, OverflowError):
             raise UsageError(f"{path}: a record of /attempt has a value of another kind: {dict(value)}") from None
-        insertion, name = first + number, f"insertion {first + number}, attempt {attempt}"
+        insertion, name = first + number, f"{prefix}insertion {number}, attempt {attempt}"
         if planar.shape != (3,) or not np.isfinite(planar).all():
             raise UsageError(f"{path}: {name}: planar_pose must be three finite numbers, got {value['planar_pose']}")
         if value["outcome"] == "inserted":

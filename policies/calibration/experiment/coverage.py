@@ -42,7 +42,7 @@ def coverage_table(result: dict[str, Any]) -> Table:
         "covered_worlds": "all known in their intervals",
         "known": "known parameters",
         "known_in_interval": "of these in the interval",
-        "converged_worlds": "searches agree",
+        "converged_worlds": "starts agree",
         "jointly_covered_worlds": "of these all in the joint region",
     }
     table = Table(*columns.values())

@@ -97,7 +97,7 @@ def expected_widths(world: RecordedWorld, *, attempts: int | None = None) -> dic
     point = np.array([float(p.whitened(np.array(world.truth[p.name]))) for p in readings.fitted])
     misalignment = world.misalignment[recordings.insertion]
     attempts_made = Attempts(misalignment, recordings.planar_pose, world.heights, recordings.depth)
-    each = information(readings, point, attempts_made, recordings.noise() / readings.scale)
+    each = information(readings, point, attempts_made, recordings.noise() / readings.scale, used=recordings.used)
     total = np.eye(len(readings.fitted))
     for insertion in np.unique(recordings.insertion):
         of_part = each[recordings.insertion == insertion][:attempts].sum(0)

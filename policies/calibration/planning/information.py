@@ -18,6 +18,15 @@ _STEP = 0.2  # of differences in parameters and start heights, in standard devia
 
 
 @dataclass(frozen=True)
+class Known:
+    """What is known of the whitened parameters: a normal distribution, and the drift of the pads [N]."""
+
+    mean: Array
+    covariance: Array
+    drift: float
+
+
+@dataclass(frozen=True)
 class Attempts:
     """n attempts, as in `Recordings`."""
 
@@ -31,18 +40,27 @@ class Attempts:
         return Descents(in_hole(self.misalignment + shift, self.planar_pose), self.z, self.depth)
 
 
-def information(readings: ReadingModel, point: Array, attempts: Attempts, noise: float, drift: float = DRIFT) -> Array:
+def information(
+    readings: ReadingModel,
+    point: Array,
+    attempts: Attempts,
+    noise: float,
+    *,
+    used: NDArray[np.bool_],
+    drift: float = DRIFT,
+) -> Array:
     """Fisher information of each of n attempts about the whitened parameters and its misalignment.
 
     Shape (n, count + 3, count + 3), with the misalignment in units of `POSE_STEP`; the start height of each attempt is
     unknown. `noise` is the standard deviation of the difference of two readings of a marker [N], `drift` that of a
-    common shift of a pad [N]. Slopes are differences of simulated readings, which are faster than exact derivatives for
-    many descents. Raises SimulationError when no descent can be simulated.
+    common shift of a pad [N]; `used` are the markers that are compared (markers,). Slopes are differences of simulated
+    readings, which are faster than exact derivatives for many descents. Raises SimulationError when no descent can be
+    simulated.
     """
     reading, columns, ok = _slopes(readings, point, attempts)
     if not ok.any():
         raise SimulationError("no descent can be simulated with these parameters")
-    errors = ErrorModel(noise, np.sqrt((reading**2).mean((1, 2))), np.ones(reading.shape[1], dtype=bool), drift=drift)
+    errors = ErrorModel(noise, np.sqrt((reading[:, used] ** 2).mean((1, 2))), used, drift=drift)
     rows = np.arange(len(reading))
     jacobian = np.stack([errors.whiten(columns[..., i], rows) for i in range(columns.shape[-1])], -1)
     full = np.einsum("nki,nkj->nij", jacobian, jacobian) / errors.cluster_size[:, None, None]

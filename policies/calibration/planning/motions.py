@@ -15,12 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import SimulationError, UsageError
-from gelflow.policies.calibration.fit import FitResult
 from gelflow.policies.calibration.model.error_model import DRIFT
 from gelflow.policies.calibration.model.parameters import FARTHEST
 from gelflow.policies.calibration.model.reading_model import ReadingModel, displacement_scale
 from gelflow.policies.calibration.model.shear_model import Descents
-from gelflow.policies.calibration.planning.information import Attempts, information, pose_prior, without_pose
+from gelflow.policies.calibration.planning.information import Attempts, Known, information, pose_prior, without_pose
 from gelflow.policies.calibration.problem import in_hole
 from gelflow.policies.calibration.recordings import Recordings
 from gelflow.session.motion_plan import PlannedMotion
@@ -52,7 +51,7 @@ class Plan:
 def plan_motions(
     recordings: Recordings,
     *,
-    fitted: FitResult | None = None,
+    known: Known | None = None,
     count: int = MOTIONS,
     workspace: tuple[float, float, float] | None = None,
     stop_shear_mm: float = STOP_SHEAR_MM,
@@ -64,8 +63,8 @@ def plan_motions(
 
     Parameters
     ----------
-    recordings: give task, unit and grasp, and the noise if they have attempts
-    fitted: what is known already; None: the priors
+    recordings: give task, unit, grasp and the markers that are compared, and the noise if they have attempts
+    known: what is known already, see `Calibration.known`; None: the priors
     workspace: largest |x|, |y| [m], |yaw| [rad] of the gripper about the taught hole; None: that of the task
     stop_shear_mm: mean shear along the finger at which contact stops a descent: more has more information
     scenarios: number of scenarios over which the information is averaged
@@ -78,21 +77,21 @@ def plan_motions(
     task, rng = recordings.task, np.random.default_rng((seed, 0x9A2))
     poses = candidates(task, workspace)
     noise = recordings.noise() / readings.scale if len(recordings) else USUAL_NOISE
-    drift, joint = (DRIFT, None) if fitted is None else (fitted.best.drift, fitted.joint_distribution)
+    drift = DRIFT if known is None else known.drift
     per_newton = displacement_scale(readings.forces.scene)
     found = []
     for k in range(scenarios):
-        point = _point(len(readings.fitted), joint, rng)
+        point = _point(len(readings.fitted), known, rng)
         misalignment = task.draw_misalignment(rng, 1)[0]
         with contextlib.suppress(SimulationError):  # a gripper that cannot hold the part
             depths, shear = _stops(readings, point, in_hole(misalignment, poses), stop_shear_mm / per_newton)
             attempts = Attempts(misalignment, poses, np.zeros(len(poses)), depths)
-            each = information(readings, point, attempts, noise, drift)
+            each = information(readings, point, attempts, noise, used=recordings.used, drift=drift)
             found.append(np.where((shear > _CONTACT_SHEAR_MM / per_newton)[:, None, None], each, 0.0))
         progress(k + 1)
     if not found:
         raise SimulationError("no plan: the attempts cannot be simulated with the parameters of any scenario")
-    before: Array = np.eye(len(readings.fitted)) if joint is None else np.asarray(np.linalg.inv(joint[1]))
+    before: Array = np.eye(len(readings.fitted)) if known is None else np.asarray(np.linalg.inv(known.covariance))
     if not any(each.any() for each in found):
         raise UsageError(
             "no motion to plan: none within the workspace is expected to touch the rim; allow a larger workspace, or "
@@ -123,13 +122,12 @@ def candidates(task: InsertionTask, workspace: tuple[float, float, float] | None
     return inside
 
 
-def _point(count: int, joint: tuple[Array, Array] | None, rng: np.random.Generator) -> Array:
-    """Whitened parameters of a scenario: of the prior, or of the joint distribution of a fit, see `FitResult`."""
+def _point(count: int, known: Known | None, rng: np.random.Generator) -> Array:
+    """Whitened parameters of a scenario: of the prior, or of what is known."""
     drawn = np.clip(rng.normal(size=count), -1.7, 1.7)
-    if joint is None:
+    if known is None:
         return _SPREAD * drawn
-    mean, covariance = joint
-    return np.asarray(np.clip(mean + np.linalg.cholesky(covariance) @ drawn, -FARTHEST, FARTHEST))
+    return np.asarray(np.clip(known.mean + np.linalg.cholesky(known.covariance) @ drawn, -FARTHEST, FARTHEST))
 
 
 def _stops(readings: ReadingModel, point: Array, poses: Array, stop_shear: float) -> tuple[Array, Array]:

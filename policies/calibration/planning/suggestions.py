@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import SimulationError
-from gelflow.policies.calibration.fit import FitResult
-from gelflow.policies.calibration.planning.information import Attempts, information, pose_prior, without_pose
+from gelflow.policies.calibration.model.error_model import DRIFT
+from gelflow.policies.calibration.planning.information import Attempts, Known, information, pose_prior, without_pose
 from gelflow.policies.calibration.problem import Problem
 
 Array = NDArray[np.float64]
@@ -36,22 +36,23 @@ class Suggestion:
     narrowed: dict[str, float]  # parameter → width of its interval relative to the present one, below 0.9
 
 
-def suggest(problem: Problem, result: FitResult, count: int = 3) -> list[Suggestion]:
-    """The `count` attempts with the highest information, the best first."""
-    covariance = result.joint_distribution[1]
-    known = np.linalg.inv(covariance)
-    before = np.sqrt(np.diag(covariance))
+def suggest(problem: Problem, known: Known | None, count: int = 3) -> list[Suggestion]:
+    """The `count` attempts with the highest information, the best first; `known` None: only the priors are known."""
+    parameters = len(problem.fitted)
+    known = known or Known(np.zeros(parameters), np.eye(parameters), DRIFT)
+    present = np.linalg.inv(known.covariance)
+    before = np.sqrt(np.diag(known.covariance))
+    noise, used = problem.errors.noise, problem.errors.used
     found = []
     for text, pose, deeper in _CANDIDATES:
         depth = _DEPTH + deeper
         try:
             attempt = Attempts(np.zeros(3), np.array([pose]), np.zeros(1), np.array([depth]))
-            noise, drift = problem.errors.noise, result.best.drift
-            added = information(problem.readings, result.best.point, attempt, noise, drift)[0]
-            after = np.linalg.inv(known + without_pose(added, pose_prior(problem.recordings.task)))
+            added = information(problem.readings, known.mean, attempt, noise, used=used, drift=known.drift)[0]
+            after = np.linalg.inv(present + without_pose(added, pose_prior(problem.recordings.task)))
         except SimulationError:
             continue
-        gain = 0.5 * float(np.linalg.slogdet(covariance)[1] - np.linalg.slogdet(after)[1])
+        gain = 0.5 * float(np.linalg.slogdet(known.covariance)[1] - np.linalg.slogdet(after)[1])
         ratio = np.sqrt(np.diag(after)) / before
         narrowed = {p.name: float(r) for p, r in zip(problem.fitted, ratio, strict=True) if r < 0.9}
         found.append(Suggestion(text, pose, depth, gain, narrowed))

@@ -48,7 +48,7 @@ def _show(output: Output, recordings: Recordings, result: SimulatedSession, pict
             {
                 "unit": recordings.unit,
                 "noise": recordings.noise(),
-                "noisy_markers": int((~result.used).sum()),
+                "unused_markers": int((~result.used).sum()),
                 "error": result.error,
                 "attempts": [
                     {"name": name, "relative_error": float(error), "cosine": float(cosine)}

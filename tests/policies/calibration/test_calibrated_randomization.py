@@ -10,7 +10,7 @@ import pytest
 
 from gelflow.cli.main import main
 from gelflow.errors import UsageError
-from gelflow.policies.calibration.calibrated_randomization import calibrated_randomization, read_randomization
+from gelflow.policies.calibration.calibrated_randomization import SAMPLES, calibrated_randomization, read_randomization
 from gelflow.policies.calibration.calibration import Calibration
 from gelflow.policies.calibration.experiment.worlds import RecordedWorld
 from gelflow.policies.calibration.fit import FitResult, StartResult
@@ -43,7 +43,7 @@ def test_the_joint_distribution_includes_what_starts_disagree_about() -> None:
     fit = FitResult((start([0.5, 0, 0], narrow), start([-0.5, 0, 0], narrow)), 3)
     mean, covariance = fit.joint_distribution
     np.testing.assert_allclose(mean, 0)
-    np.testing.assert_allclose(covariance, np.diag([0.26, 1, 0.01]), atol=1e-12)  # none is wider than its prior
+    np.testing.assert_allclose(covariance, np.diag([0.51, 1, 0.01]), atol=1e-12)  # none is wider than its prior
     drawn = fit.draw(np.random.default_rng(0), 4000)
     np.testing.assert_allclose(np.cov(drawn.T), covariance, atol=0.05)
 
@@ -71,6 +71,20 @@ def test_samples_stay_within_three_times_the_ranges(calibrated: Calibration) -> 
     assert set(samples) == {*QUANTITIES, *SENSORS} and len({len(values) for values in samples.values()}) == 1
     assert max(samples["pad_kn"]) == pytest.approx(3 * 1.4e4, rel=1e-4)
     assert min(samples["crosstalk"]) == 0
+
+
+def test_limits_do_not_change_combinations_that_are_known(calibrated: Calibration) -> None:
+    n = calibrated.fit.count
+    names = [e.parameter.name for e in calibrated.estimates]
+    i, k = names.index("pad_ks"), names.index("grasp_force")
+    covariance = 1e-6 * np.eye(n)
+    covariance[np.ix_([i, k], [i, k])] += np.array([[1, -1], [-1, 1]])
+    mean = np.zeros(n)
+    mean[i] = 1.5  # close to the limit of 3 ** 0.5: nearly half of the distribution is beyond
+    samples = calibrated_randomization(confirmed(calibrated, start(mean, covariance)))["samples"]
+    whitened = [calibrated.parameters[j].whitened(np.array(samples[names[j]])) for j in (i, k)]
+    np.testing.assert_allclose(whitened[0] + whitened[1], 1.5, atol=0.01)
+    assert len(samples["pad_ks"]) == SAMPLES and whitened[0].max() <= 3**0.5 + 1e-3
 
 
 def test_the_gain_of_both_pads_multiplies_the_stiffness_of_the_markers(calibrated: Calibration) -> None:

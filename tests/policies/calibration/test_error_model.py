@@ -69,7 +69,7 @@ def test_noisy_markers_do_not_count_and_are_reported(world: RecordedWorld) -> No
     recordings = with_noise(world.recordings.of(np.array([0, 1])), 1e4)
     result = calibrate(recordings, settings=LITTLE)
     flow_maps = plain_report(result, [])["flow_maps"]
-    assert flow_maps["noisy_markers"] == len(DEFECTIVE)
+    assert flow_maps["unused_markers"] == len(DEFECTIVE)
     for key in ("before", "after", "rms"):
         assert flow_maps["fitted"][key] < 0.1  # [N]; the defective markers deviate by 10 N
     assert Problem(recordings).errors.rms.max() < 0.1

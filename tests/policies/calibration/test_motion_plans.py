@@ -17,7 +17,7 @@ from gelflow.policies.calibration.fit import FitResult, StartResult
 from gelflow.policies.calibration.model.parameters import FARTHEST
 from gelflow.policies.calibration.model.reading_model import ReadingModel
 from gelflow.policies.calibration.model.shear_model import Descents
-from gelflow.policies.calibration.planning.information import Attempts, information, pose_prior, without_pose
+from gelflow.policies.calibration.planning.information import Attempts, Known, information, pose_prior, without_pose
 from gelflow.policies.calibration.planning.motions import STOP_SHEAR_MM, plan_motions
 from gelflow.policies.calibration.planning.suggestions import suggest
 from gelflow.policies.calibration.problem import POSE_STEP, Problem, in_hole
@@ -62,7 +62,7 @@ def test_attempts_without_contact_have_no_information(world: RecordedWorld) -> N
     count = len(readings.fitted)
     pose = np.array([[8e-3, 0.0, 0.0], [8e-3, 0.0, 0.0]])
     attempts = Attempts(np.zeros((2, 3)), pose, np.zeros(2), np.array([0.9e-3, 0.1e-3]))
-    touching, free = information(readings, np.zeros(count), attempts, 1e-4)
+    touching, free = information(readings, np.zeros(count), attempts, 1e-4, used=LAB.used)
     for matrix in (touching, free):
         assert np.linalg.eigvalsh(matrix).min() > -1e-8 * np.abs(touching).max()
     assert np.trace(touching) > 1e3 * np.trace(free)
@@ -77,7 +77,7 @@ def test_the_information_is_that_about_the_misalignment_of_the_part(world: Recor
     n, (dx, dy) = 8, 9e-3 * np.array([np.cos(np.arange(8) * np.pi / 4), np.sin(np.arange(8) * np.pi / 4)])
     misalignment, planar = np.tile((1e-3, -2e-3, 0.05), (n, 1)), np.column_stack([dx, dy, np.full(n, 0.1)])
     attempts = Attempts(misalignment, planar, np.zeros(n), np.full(n, 0.9e-3))
-    found = information(readings, point, attempts, 1e-4, drift=0.0)[:, count + 2, count + 2]
+    found = information(readings, point, attempts, 1e-4, used=LAB.used, drift=0.0)[:, count + 2, count + 2]
 
     def reading(yaw: float) -> np.ndarray:
         values = {name: np.full(n, value) for name, value in readings.values(point).items()}
@@ -110,8 +110,8 @@ def test_a_plan_without_contact_is_refused(monkeypatch: pytest.MonkeyPatch) -> N
 @pytest.mark.slow
 def test_a_plan_depends_on_what_is_known_already() -> None:
     count = len(ReadingModel(LAB).fitted)
-    known = StartResult(np.zeros(count), np.zeros((1, 3)), 1e-4 * np.eye(count), 0.0, 1.0, 1e-3)
-    plan = plan_motions(LAB, fitted=FitResult((known,), count), count=2, workspace=NEAR, scenarios=3)
+    known = Known(np.zeros(count), 1e-4 * np.eye(count), 1e-3)
+    plan = plan_motions(LAB, known=known, count=2, workspace=NEAR, scenarios=3)
     unknown = plan_motions(LAB, count=2, workspace=NEAR, scenarios=3)  # in the first, no attempt has contact
     assert plan.gains[0] < 0.5 * unknown.gains[0]
     assert all(after <= before < 0.1 for before, after in plan.widths.values())
@@ -125,21 +125,35 @@ def test_no_direction_of_a_fit_is_wider_than_its_prior(world: RecordedWorld, mon
         points.append(point)
         return np.full(len(poses), 1e-3), np.ones(len(poses))
 
-    def informed(readings: ReadingModel, point: np.ndarray, attempts: Attempts, *errors: float) -> np.ndarray:
+    def informed(
+        readings: ReadingModel, point: np.ndarray, attempts: Attempts, *errors: object, **options: object
+    ) -> np.ndarray:
         return np.tile(4.0 * np.eye(count + 3), (len(attempts.depth), 1, 1))
 
     monkeypatch.setattr("gelflow.policies.calibration.planning.motions._stops", stops)
     monkeypatch.setattr("gelflow.policies.calibration.planning.motions.information", informed)
     monkeypatch.setattr("gelflow.policies.calibration.planning.suggestions.information", informed)
     end = StartResult(np.full(count, 3.9), np.zeros((1, 3)), 9.0 * np.eye(count), 0.0, 1.0, 1e-3)
-    fitted = FitResult((end,), count)
-    plan = plan_motions(LAB, fitted=fitted, count=1, workspace=NEAR)
+    known = Known(*FitResult((end,), count).joint_distribution, end.drift)
+    plan = plan_motions(LAB, known=known, count=1, workspace=NEAR)
     assert 3.9 < np.max(points) <= FARTHEST
     expected = 0.5 * count * np.log(5)  # of four times the information of the prior
     assert plan.gains[0] == pytest.approx(expected)
     assert list(plan.widths.values()) == [pytest.approx((1.0, 1 / np.sqrt(5)))] * count
-    suggestions = suggest(Problem(world.recordings.of(np.array([0])), threads=1), fitted)
+    suggestions = suggest(Problem(world.recordings.of(np.array([0])), threads=1), known)
     assert [s.gain for s in suggestions] == pytest.approx([expected] * 3)
+
+
+def test_markers_that_no_camera_shows_have_no_information(world: RecordedWorld) -> None:
+    recordings = world.recordings
+    readings, count = ReadingModel(recordings), len(ReadingModel(recordings).fitted)
+    attempts = Attempts(np.zeros(3), np.array([[3e-3, 0, 0]]), np.zeros(1), np.array([1e-3]))
+    half = recordings.used & (np.arange(len(recordings.used)) % 2 == 0)
+    whole, part = (
+        information(readings, np.zeros(count), attempts, 1e-4, used=used, drift=0.0)[0]
+        for used in (recordings.used, half)
+    )
+    assert 0 < np.trace(part) < 0.8 * np.trace(whole)
 
 
 def test_planned_attempts_are_made_on_one_part_of_the_same_world(world: RecordedWorld) -> None:

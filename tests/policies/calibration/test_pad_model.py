@@ -88,6 +88,22 @@ def test_the_noise_of_interpolated_markers_is_that_of_one_marker(world: Recorded
     assert recordings.noise() == pytest.approx(flow.std(), rel=0.1)
 
 
+def test_the_noise_of_two_pads_is_their_root_mean_square(world: RecordedWorld) -> None:
+    noise = 0.01 * np.random.default_rng(0).normal(size=(20, 2, GRID.rows, GRID.cols, 2))
+    noise[:, 1] *= 3
+    recordings = dataclasses.replace(world.recordings, flow=noise, printed=None)
+    assert recordings.noise() == pytest.approx(0.01 * np.sqrt(5), rel=0.15)
+
+
+def test_a_small_print_has_an_estimate_of_its_noise(world: RecordedWorld) -> None:
+    """Most markers of the policy's grid are copies of the nearest printed one, so their second differences are 0."""
+    small = Grid(4, 3, 2.0, (2.0, 0.0))
+    printed = 0.01 * np.random.default_rng(0).normal(size=(20, 2, 12, 2))
+    flow = np.einsum("gm,npmc->npgc", resampling_weights(small.positions(), GRID), printed)
+    recordings = dataclasses.replace(world.recordings, flow=flow.reshape(20, 2, GRID.rows, GRID.cols, 2), printed=small)
+    assert recordings.noise() == pytest.approx(flow.std(), rel=0.3)
+
+
 @pytest.mark.parametrize("shown", [13, 8])
 def test_the_noise_is_that_of_the_measured_markers(world: RecordedWorld, shown: int) -> None:
     """A runner fills rows that the camera does not show with means of their neighbours, which are smooth."""

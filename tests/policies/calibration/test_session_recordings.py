@@ -18,8 +18,10 @@ from gelflow.errors import UsageError
 from gelflow.observation import Grid
 from gelflow.perception.frames import CameraMount
 from gelflow.policies.calibration.calibrated_scene import write_scene
+from gelflow.policies.calibration.calibration import Calibration
 from gelflow.policies.calibration.comparison import SimulatedSession
 from gelflow.policies.calibration.experiment.worlds import RecordedWorld
+from gelflow.policies.calibration.flow_picture import MAX_SHOWN, draw_flow_maps
 from gelflow.policies.calibration.recordings import Recordings
 from gelflow.policies.calibration.session_recordings import read_recordings
 from gelflow.session import SessionRecorder
@@ -89,6 +91,7 @@ def test_recordings_are_read_from_sessions(tmp_path: Path, world: RecordedWorld)
     expected = world.recordings.of(np.array([0, 1]))
     read = read_recordings([path, other])
     n = len(expected)
+    assert (read.names[0], read.names[n]) == ("a, insertion 0, attempt 0", "b, insertion 0, attempt 0")
     assert read.insertion.tolist() == [*expected.insertion, *(expected.insertion + 2)]
     np.testing.assert_allclose(read.flow[:n], 10 * expected.flow, rtol=1e-5, atol=1e-7)
     np.testing.assert_allclose(read.depth[n:], expected.depth)
@@ -235,6 +238,15 @@ def test_replay_compares_flow_maps_with_the_simulation(
     assert "leave one of them out" in capsys.readouterr().err
 
 
+def test_a_picture_states_how_many_attempts_it_omits(world: RecordedWorld) -> None:
+    flow = np.repeat(world.recordings.flow[:1].reshape(1, -1, 2), MAX_SHOWN + 1, axis=0)
+    for count, text in ((MAX_SHOWN, "blue"), (MAX_SHOWN + 1, f"first {MAX_SHOWN} of {MAX_SHOWN + 1} attempts; blue")):
+        figure = draw_flow_maps(
+            flow[:count], [("", flow)], ["name"] * count, INSERTION.grid, "mm", used=world.recordings.used, note=""
+        )
+        assert figure._supxlabel.get_text().startswith(text)
+
+
 def test_replay_prints_the_errors_before_it_saves_the_picture(
     tmp_path: Path, world: RecordedWorld, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -275,8 +287,11 @@ def test_no_file_of_the_folder_is_overwritten(tmp_path: Path, capsys: pytest.Cap
 
 def test_the_report_is_neither_a_plan_nor_a_link(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
-    assert main(["calibrate", "missing.mcap", "--out", str(out), "--plan", str(out / "report.json")]) == 2
-    assert "is a file of the report; give the plan another name" in capsys.readouterr().err
+    for plan in (out, out / "report.json"):
+        assert main(["calibrate", "missing.mcap", "--out", str(out), "--plan", str(plan)]) == 2
+        assert "is the folder of --out or a file in it; give the plan another name" in capsys.readouterr().err
+    assert main(["calibrate", "--out", str(out), "--plan", str(tmp_path / "plan.toml")]) == 2
+    assert "--out is the folder for the report on a SESSION" in capsys.readouterr().err
     (tmp_path / "scene.toml").symlink_to("nowhere")
     assert main(["calibrate", "missing.mcap", "--out", str(tmp_path)]) == 2
     assert "scene.toml exists; name a new folder with --out" in capsys.readouterr().err
@@ -303,6 +318,23 @@ def test_the_scene_does_not_depend_on_the_encoding_of_the_locale(
     result: Any = SimpleNamespace(estimates=[known])
     scene, model = write_scene(result, tmp_path)
     assert load_scene(scene).name and model.exists()
+    before = scene.read_bytes()
+    with pytest.raises(FileExistsError):  # written by another calibration in the meantime
+        write_scene(result, tmp_path)
+    assert scene.read_bytes() == before
+
+
+def test_the_report_is_written_where_the_output_cannot_be_printed(
+    tmp_path: Path, world: RecordedWorld, calibrated: Calibration, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def closed(*arguments: Any) -> None:
+        raise SystemExit(1)  # as when `head` has read enough
+
+    monkeypatch.setattr("gelflow.cli.commands.calibrate.calibrate", lambda *arguments, **options: calibrated)
+    monkeypatch.setattr("gelflow.cli.commands.calibrate._show", closed)
+    with pytest.raises(SystemExit):
+        main(["calibrate", str(write_session(tmp_path / "a.mcap", world)), "--out", str(tmp_path / "out")])
+    assert (tmp_path / "out" / "report.json").exists() and (tmp_path / "out" / "report.html").exists()
 
 
 @pytest.mark.slow

@@ -44,8 +44,17 @@ def test_forces_count_only_if_the_held_out_insertion_is_predicted(
         assert confirmed(result) == (every if limit else every - set(QUANTITIES)) and result.predicted is (limit > 0)
         assert any("does not predict the held-out insertion" in line for line in error_lines(result)) is (limit == 0)
         assert plain_report(result, [])["flow_maps"]["predicted"] is (limit > 0)
+        # Plans start from what is confirmed, and from the priors of the rest.
+        assert result.known is not None
+        mean, covariance = result.fit.joint_distribution
+        for i, parameter in enumerate(result.parameters):
+            if limit or parameter.name not in QUANTITIES:
+                assert (result.known.mean[i], result.known.covariance[i, i]) == (mean[i], covariance[i, i])
+            else:
+                assert result.known.mean[i] == 0
+                np.testing.assert_array_equal(result.known.covariance[i], np.eye(len(mean))[i])
     monkeypatch.setattr(calibration, "REPRODUCED", 0.0)
-    assert not confirmed(with_present_limits())
+    assert not confirmed(with_present_limits()) and with_present_limits().known is None
 
 
 def test_starts_that_end_at_different_costs_widen_the_intervals() -> None:
@@ -58,7 +67,7 @@ def test_starts_that_end_at_different_costs_widen_the_intervals() -> None:
     assert width(7.0, 12.0) == width(7.0, 8.0, 12.0, 20.0) == pytest.approx(math.sqrt(2))
 
 
-def test_nothing_counts_as_known_unless_more_than_half_of_the_searches_agree(
+def test_nothing_counts_as_known_unless_more_than_half_of_the_starts_agree(
     calibrated: Calibration, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(calibration, "REPRODUCED", math.inf)
@@ -69,7 +78,8 @@ def test_nothing_counts_as_known_unless_more_than_half_of_the_searches_agree(
         result = dataclasses.replace(calibrated, fit=fit, estimates=estimates)
         assert result.converged is bool(confirmed(result)) is bool(calibrated_randomization(result)["samples"])
         assert result.converged is (used > others) is plain_report(result, [])["flow_maps"]["converged"]
-        line = f"{used} of {used + others} searches found this fit"
+        assert (result.known is None) is not result.converged
+        line = f"only {used} of {used + others} starts of the fit reached this residual"
         assert any(line in text for text in error_lines(result)) is not result.converged
 
 

@@ -69,6 +69,15 @@ def test_the_pads_carry_the_weight_and_the_grasp_force(friction: str) -> None:
     assert np.abs(reading[..., 1]).max() < 1e-3 * reading[..., 0].min()
 
 
+def test_the_gripper_presses_with_the_largest_force_of_a_lab_file() -> None:
+    force = 80.0
+    attempts = InsertionAttempts(1, randomization=SILENT.replace(grasp_force=force))
+    attempts.draw(np.random.default_rng(0))
+    for side in ("left", "right"):
+        wrench = attempts.sim.wrenches()[0, attempts.sim.model.contact_names.index(f"pad_{side}")]
+        assert abs(wrench[3]) == pytest.approx(force, rel=1e-3)
+
+
 @pytest.mark.parametrize(
     ("task", "values", "lowest"),
     [(PUBLISHED_INSERTION, SILENT, 24.7e-3), (INSERTION, STIFF, 24.4e-3)],

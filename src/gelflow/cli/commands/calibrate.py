@@ -29,7 +29,8 @@ from gelflow.errors import UsageError
 from gelflow.part import CUBOID, Part
 from gelflow.policies.calibration.calibrated_scene import MODEL, SCENE, write_scene
 from gelflow.policies.calibration.calibration import Calibration, calibrate
-from gelflow.policies.calibration.fit import FitResult, FitSettings
+from gelflow.policies.calibration.fit import FitSettings
+from gelflow.policies.calibration.planning.information import Known
 from gelflow.policies.calibration.planning.motions import (
     MOTIONS,
     SCENARIOS,
@@ -48,6 +49,7 @@ from gelflow.session.motion_plan import save_motion_plan
 from gelflow.session.records import readable_json
 from gelflow.sim.tasks.parts import load_part, part_names
 
+_FOLDER = Path("out/calibration")
 _QUICK = FitSettings(starts=2, members=48, nearby=32, poses=8, steps=1)
 
 
@@ -73,9 +75,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "part of the plan or of the sessions, which do not contain meshes",
         default="the cuboid, or that of the sessions",
     )
-    add_out(
-        parser, "new folder for report.html, report.json and scene.toml", default=Path("out/calibration"), folder=True
-    )
+    add_out(parser, f"new folder for report.html, report.json and scene.toml (default {_FOLDER})", folder=True)
     add_seed(parser)
     add_quick(parser)
     add_json(parser)
@@ -97,12 +97,13 @@ def run(args: argparse.Namespace) -> int:
         finally:  # the result is printed even where its file cannot be written
             output.result({"plan": _plain_plan(plan)})
         return SUCCESS
+    args.out = args.out or _FOLDER
     files = [args.out / "report.json", args.out / "report.html", args.out / SCENE, args.out / MODEL]
     for file in files:
         if is_taken(file):
             raise UsageError(f"{file} exists; name a new folder with --out")
-        if args.plan is not None and args.plan.resolve() == file.resolve():
-            raise UsageError(f"--plan {args.plan} is a file of the report; give the plan another name")
+        if args.plan is not None and args.plan.resolve() in (file.resolve(), args.out.resolve()):
+            raise UsageError(f"--plan {args.plan} is the folder of --out or a file in it; give the plan another name")
     recordings = read_attempts(args.sessions, args.part)
     if args.plan is not None:
         candidates(recordings.task, _workspace(lab))
@@ -117,13 +118,11 @@ def run(args: argparse.Namespace) -> int:
             processes=min(settings.starts, os.cpu_count() or 1),
             progress=lambda done: progress.update(bar, completed=done),
         )
-    if not output.json:
-        _show(output, result)
     values = plain_report(result, args.sessions)
     try:
         _write_report(args, output, result, files, readable_json(values))
         if args.plan is not None:
-            plan = _make_plan(args, lab, recordings, result.fit)
+            plan = _make_plan(args, lab, recordings, result.known)
             values["plan"] = _plain_plan(plan)
             _write_plan(args, output, recordings, plan)
     finally:  # the result is printed even where a file cannot be written
@@ -134,7 +133,10 @@ def run(args: argparse.Namespace) -> int:
 def _write_report(
     args: argparse.Namespace, output: Output, result: Calibration, files: Sequence[Path], report: str
 ) -> None:
-    """Write the new files: `report` as report.json, the page, and the scene. Raises UsageError if that fails."""
+    """Write the new files: `report` as report.json, the page, and the scene; then print the result.
+
+    Raises UsageError if the files cannot be written; the result is printed nevertheless.
+    """
     try:
         with removed_on_error(*files):
             _write_new(files[0], report)
@@ -142,6 +144,9 @@ def _write_report(
             scene = write_scene(result, args.out)
     except OSError as error:
         raise UsageError(f"cannot write the report to {args.out}: {error}") from error
+    finally:
+        if not output.json:
+            _show(output, result)
     output.text(f"the report is {files[1]}")
     if scene:
         output.text(f"the scene with the known values is {scene[0]}")
@@ -166,6 +171,8 @@ def _check(args: argparse.Namespace) -> None:
         raise UsageError("name a recorded session, or a new plan file with --plan")
     if args.plan is None and args.lab is not None:
         raise UsageError("--lab gives the limits of --plan; name the plan file, or leave --lab out")
+    if not args.sessions and args.out is not None:
+        raise UsageError("--out is the folder for the report on a SESSION; leave it out")
     if not args.sessions and args.quick:
         raise UsageError("--quick is for the fit of a SESSION; leave it out")
     if args.plan is not None and is_taken(args.plan):
@@ -178,18 +185,24 @@ def _lab_recordings(args: argparse.Namespace, lab: Lab | None) -> Recordings:
     if lab is None:
         return nothing_recorded(task, grasp_force=None, grasp_height=None)
     height = lab.part.grasp_height - task.part.size[2] / 2
-    printed = lab.cameras.left.mount.grid
-    return nothing_recorded(task, grasp_force=lab.gripper.grasp_force, grasp_height=height, printed=printed)
+    mounts = [camera.mount for camera in (lab.cameras.left, lab.cameras.right)]
+    return nothing_recorded(
+        task,
+        grasp_force=lab.gripper.grasp_force,
+        grasp_height=height,
+        printed=mounts[0].grid,
+        visible=[mount.marker_order() >= 0 for mount in mounts],
+    )
 
 
-def _make_plan(args: argparse.Namespace, lab: Lab | None, recordings: Recordings, fitted: FitResult | None) -> Plan:
+def _make_plan(args: argparse.Namespace, lab: Lab | None, recordings: Recordings, known: Known | None) -> Plan:
     """The plan of --plan and --motions, with a progress bar."""
     stop = STOP_SHEAR_MM if lab is None else lab.descent.largest_stop_shear_mm
     with progress_bar(count=True) as progress:
         bar = progress.add_task("planning", total=SCENARIOS)
         return plan_motions(
             recordings,
-            fitted=fitted,
+            known=known,
             count=_wanted(args),
             workspace=_workspace(lab),
             stop_shear_mm=stop,
@@ -199,13 +212,15 @@ def _make_plan(args: argparse.Namespace, lab: Lab | None, recordings: Recordings
 
 
 def _write_plan(args: argparse.Namespace, output: Output, recordings: Recordings, plan: Plan) -> None:
-    """Print a plan, then write it. Raises UsageError when its file exists or cannot be written."""
-    for line in _plan_lines(plan):
-        output.text(line)
-    if len(plan.motions) < (wanted := _wanted(args)):
-        output.text(f"the workspace has {len(plan.motions)} motions to choose from, fewer than --motions {wanted}")
+    """Write a plan, then print it. Raises UsageError when its file exists or cannot be written."""
     known = "what the sessions leave open" if args.sessions else "an unknown lab"
-    save_motion_plan(plan.motions, args.plan, title=f"Written by gelflow calibrate --plan for {known}.")
+    try:
+        save_motion_plan(plan.motions, args.plan, title=f"Written by gelflow calibrate --plan for {known}.")
+    finally:
+        for line in _plan_lines(plan):
+            output.text(line)
+        if len(plan.motions) < (wanted := _wanted(args)):
+            output.text(f"the workspace has {len(plan.motions)} motions to choose from, fewer than --motions {wanted}")
     output.text(f"the plan is {args.plan}; record it with: {_run_command(args, recordings.task.part)}")
 
 
@@ -242,12 +257,13 @@ def _is_included(part: Part) -> bool:
 def _plan_lines(plan: Plan) -> list[str]:
     """Lines about the motions and what they are expected to determine."""
     lines = [
-        f"motion {k + 1}: {motion.text}: {gain:.1f} nat"
+        f"motion {k + 1}: {motion.text}: information {gain:.1f} nat"
         for k, (motion, gain) in enumerate(zip(plan.motions, plan.gains, strict=True))
     ]
     narrowed = sorted((after / before, name) for name, (before, after) in plan.widths.items() if after < 0.9 * before)
     if narrowed:
-        lines.append("expected: " + ", ".join(f"{name} to {100 * ratio:.0f} %" for ratio, name in narrowed))
+        widths = ", ".join(f"{name} {100 * ratio:.0f} %" for ratio, name in narrowed)
+        lines.append(f"expected widths of the 95 % intervals, relative to the present ones: {widths}")
     return lines
 
 
