@@ -65,8 +65,8 @@ class GraspTask(TaskDescription):
             raise UsageError(f"close_time, lift_time and hold_time must not be negative, lift_time not 0, got {times}")
         if self.force_range is not None and len(self.force_range) != 2:
             raise UsageError(f"force_range must be (low, high), got {self.force_range}")
-        if self.force_range is not None and not 0 < self.force_range[0] < self.force_range[1] <= 20:
-            raise UsageError(f"force_range must be 0 < low < high ≤ 20 N, got {self.force_range}")
+        if self.force_range is not None and not 0 < self.force_range[0] < self.force_range[1] <= 80:
+            raise UsageError(f"force_range must be 0 < low < high ≤ 80 N, got {self.force_range}")
 
     @property
     def observation_shape(self) -> tuple[int, int, int]:

@@ -130,6 +130,17 @@ def test_load_rolls_to_the_lower_end_and_stays() -> None:
     assert np.abs(again).max() <= 0.031
 
 
+@pytest.mark.parametrize("force", [10.0, 80.0])
+def test_pads_press_with_the_grasp_force(force: float) -> None:
+    batch = attempted([0.0], 0.1, randomization=QUIET.replace(grasp_force=force))
+    sim, names = batch.sim, list(batch.sim.model.contact_names)
+    sim.params[0] = batch._params[0]
+    for name, values in batch._lifted.items():
+        getattr(sim, name)[0] = values[0]
+    pressed = [abs(sim.wrenches()[0, names.index(f"pad_{side}"), 3]) for side in ("left", "right")]
+    assert pressed == pytest.approx([force, force], rel=1e-2)
+
+
 def test_policy_may_choose_the_force() -> None:
     task = GraspTask(force_range=(4.0, 16.0))
     batch = Grasp(3, task=task, threads=1)
@@ -143,7 +154,7 @@ def test_policy_may_choose_the_force() -> None:
     np.testing.assert_allclose(batch.metrics["force [N]"], [4, 10, 16])
     assert not Grasp(1, threads=1).metrics
     with pytest.raises(UsageError, match="force_range must be 0 < low < high"):
-        GraspTask(force_range=(4.0, 25.0))
+        GraspTask(force_range=(4.0, 81.0))
 
 
 def test_gripper_stays_on_the_bar_and_in_its_workspace() -> None:
