@@ -143,7 +143,7 @@ class CameraCalibration:
         self.check_size(image)
         scale = max(self.pixels_per_mm())
         size = np.array([self.cols + 1, self.rows + 1]) * self.spacing_mm  # (right, down) [mm]
-        right, down = (np.arange(round(length * scale)) / scale - length / 2 for length in size)
+        right, down = ((np.arange(round(length * scale)) + 0.5) / scale - length / 2 for length in size)
         mesh = np.stack(np.meshgrid(right, down), axis=-1)
         positions = self.to_pixels(mesh.reshape(-1, 2)).reshape(mesh.shape).astype(np.float32)
         return np.asarray(cv2.remap(image, positions[..., 0], positions[..., 1], cv2.INTER_CUBIC), dtype=np.uint8)

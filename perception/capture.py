@@ -65,9 +65,10 @@ class Capture:
 
     def _recorded(self) -> Iterator[CapturedImage]:
         capture = self._open()
-        rate = capture.get(cv2.CAP_PROP_FPS)
-        rate = rate if 0.1 <= rate <= 1000 else self.rate
-        expected, stamps = capture.get(cv2.CAP_PROP_FRAME_COUNT), _VideoStamps(rate)
+        rate, expected = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
+        if not 0.1 <= rate <= 1000:
+            rate, expected = self.rate, 0.0  # the number may be an estimate with the same rate
+        stamps = _VideoStamps(rate)
         try:
             while (image := _read(capture)) is not None:
                 yield CapturedImage(image, stamps.next(capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3))
@@ -78,7 +79,8 @@ class Capture:
         missing = expected - max(number, stamps.latest * rate + 1)
         if number and missing > max(_MISSING, _MISSING_SHARE * expected):
             raise PeerError(
-                f"video {self.text} ends after {number} of {expected:.0f} images: it is truncated or damaged"
+                f"video {self.text} ends after {number} of {expected:.0f} images: it is truncated or damaged, or was "
+                "cut without encoding it again, which only hides images"
             )
 
     def _live(self) -> Iterator[CapturedImage]:

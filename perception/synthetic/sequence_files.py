@@ -35,16 +35,16 @@ class GroundTruth:
 
 def truth_file(images: Path) -> Path:
     """Path of the ground-truth file of a rendered folder or video."""
-    return images.with_suffix(".npz") if images.suffix == VIDEO else images / TRUTH
+    return images.with_suffix(".npz") if images.suffix.lower() == VIDEO else images / TRUTH
 
 
 def write_sequence(sequence: GelSequence, out: Path) -> Iterator[int]:
     """Renders `sequence` to `out`, a new folder or, with suffix .mjpeg, a video; yields the number of images written.
 
-    The ground truth is written last. Raises UsageError when a file exists or cannot be written; the images are then
-    deleted.
+    The ground truth is written last. Raises UsageError when a file exists or cannot be written. Where a sequence is not
+    finished, its images are deleted.
     """
-    video = out.suffix == VIDEO
+    video = out.suffix.lower() == VIDEO
     if not video and out.suffix.lower() in _OTHER_FILES:
         raise UsageError(f"{out}: give a folder, or a video with the suffix {VIDEO}")
     if truth_file(out).exists() or (out.exists() and not (out.is_dir() and not any(out.iterdir()))):
@@ -71,12 +71,14 @@ def write_sequence(sequence: GelSequence, out: Path) -> Iterator[int]:
         )
     except FileExistsError:  # since the check above
         raise UsageError(f"{out} exists and would be overwritten: another process writes it") from None
-    except OSError as error:
+    except BaseException as error:
         written = [out] if video else [out / f"{number:06d}.jpg" for number in range(len(position) + 1)]
         with contextlib.suppress(OSError):
             for file in (*written, truth_file(out)):
                 file.unlink(missing_ok=True)
-        raise UsageError(f"{out} cannot be written: {error.strerror}") from None
+        if isinstance(error, OSError):
+            raise UsageError(f"{out} cannot be written: {error.strerror}") from None
+        raise
 
 
 def read_truth(file: Path) -> GroundTruth:

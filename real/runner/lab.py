@@ -355,7 +355,7 @@ class Lab:
 
     def _check_times(self) -> None:
         gripper, limits = self.gripper, self.limits
-        farthest = max(LIMITS.gripper_width[1] - gripper.open_width, gripper.open_width - gripper.part_width)
+        farthest = max(LIMITS.gripper_width[1] - gripper.open_width, gripper.open_width)  # from open or closed fingers
         needed = motion_time(farthest, gripper.speed)
         text = (
             f"gripper.speed {gripper.speed} m/s is too low: {1e3 * farthest:.0f} mm take {needed:.1f} s, and "

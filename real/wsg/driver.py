@@ -10,7 +10,6 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Mapping
-from types import TracebackType
 
 from gelflow import interrupts
 from gelflow.clock import Clock
@@ -79,9 +78,7 @@ class WsgGripper:
         self.connect()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
         self.close(reason="done" if kind is None else f"{kind.__name__}: {error}")
 
     # Connection
@@ -251,7 +248,8 @@ class WsgGripper:
 
     def stop(self) -> None:
         """Stop the fingers. The device also ceases to monitor a held part. No effect in a dry run."""
-        self._stop(self._connected(), "stop", Command.STOP)
+        if error := self._stop_twice(self._connected()):
+            raise error
 
     def fast_stop(self) -> None:
         """Stop at once and lock every motion until `acknowledge_fault`. No effect in a dry run."""
@@ -390,11 +388,13 @@ class WsgGripper:
         finally:
             self._record(name, {})  # after the command, because a stop must not wait for the recorder
 
-    def _stop_twice(self, link: WsgLink) -> None:
+    def _stop_twice(self, link: WsgLink) -> GelflowError | None:
         """Stop, again after the pause between commands if it is not confirmed: it was damaged, or came too early."""
+        failure: GelflowError | None = None
         for urgent in (True, False):
             try:
                 self._stop(link, "stop", Command.STOP, urgent=urgent)
-                return
+                return None
             except GelflowError as error:
-                _log.error("the stop was not confirmed: %s", error)
+                _log.error("the stop was not confirmed: %s", failure := error)
+        return failure

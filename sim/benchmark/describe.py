@@ -317,11 +317,12 @@ def _not_modelled(scene: Scene, mechanics: Mechanics, model: Any, bodies: tuple[
             merged = "" if body.parent is None else ", merged into it with its mass"
             yield f"body {name}: rigidly attached to {body.name}{merged}; no cost"
     for pad in scene.pads:
-        if pad.law == "viscous":
+        if pad.law == "viscous" and not pad.collides:
             yield f"pad {pad.name}: viscous markers have no history; no cost until their forces are evaluated"
     shapes = {shape.name: shape.body for shape in scene.shapes}
     points = {p.name: p.body for p in scene.points}
     contacts = {frozenset((points[c.points], shapes[c.shape])) for c in scene.contacts}
+    contacts |= {frozenset((pad.body, shapes[name])) for pad in scene.pads if pad.collides for name in pad.against}
     solid = sorted({geom.body for geom in mechanics.geoms})
     apart = [
         f"{_body_name(scene, b)} and {_body_name(scene, a)}"

@@ -205,6 +205,8 @@ class Grasp(AttemptTask):
         limit = self.bar.max_center_of_mass
         if (np.abs(drawn["center_of_mass"]) > limit + 1e-9).any() or (drawn["mass"] <= 0).any():
             raise UsageError(f"reset: center_of_mass must be within ±{limit:.4g} m, and mass positive")
+        if (np.abs(drawn["start"]) > self._workspace + 1e-9).any():
+            raise UsageError(f"reset: start must be within the workspace of ±{self._workspace:.4g} m")
         self._sensors.draw(which, drawn, rng)
         self._record(which, drawn, self.randomization, center_of_mass="m", start="m")
         params = pad_parameters(drawn, elastic=self.scene.friction == "elastic")

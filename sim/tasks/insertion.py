@@ -38,6 +38,7 @@ Rows = NDArray[np.int64]
 
 # [m/s] of an attempt, as in Xu et al. (CoRL 2022): 1.1 mm in 45 steps of 5 ms, about ten times faster than the robot.
 DESCENT_SPEED = 1.1e-3 / 0.225
+_LARGEST_SLIDE = 2e-3  # of a part while the gripper closes [m]; one that slides farther is not held
 SETTLE_TIME = 0.120  # [s] until the part is at rest in the closed gripper
 ROLLOUT_SIZE = 64  # environments of one rollout
 _GRASP_STATE = ("q", "anchors", "anchored")
@@ -146,7 +147,7 @@ class InsertionAttempts:
         self._u: Array = np.zeros((num_envs, self.scene.nu))
         self._grasp = {name: np.repeat(getattr(self.sim, name)[:1], num_envs, axis=0) for name in _GRASP_STATE}
         self._end = {name: np.repeat(getattr(self.sim, name)[:1], num_envs, axis=0) for name in _STATE}
-        self._not_grasped: Mask = np.zeros(num_envs, bool)  # the closing of the gripper could not be simulated
+        self._not_grasped: Mask = np.zeros(num_envs, bool)  # the closing could not be simulated, or the part slid
         self._grasp_shear: Array = np.zeros((num_envs, self.scene.num_markers, 2))
 
     def _step_at(self, depth: float) -> int:
@@ -197,7 +198,8 @@ class InsertionAttempts:
         u[:n, self._arm_u[2]] += weight / self._param("arm_z.kp")[rows]  # gravity compensation
         sim.q[:n] = q
         sim.step(u, self._settle_steps, active=np.arange(sim.num_envs) < n)
-        self._not_grasped[rows] = sim.status[:n] != 0
+        slid = np.abs(sim.q[:n, self._part_q + 2] - self._clear_height) > _LARGEST_SLIDE
+        self._not_grasped[rows] = (sim.status[:n] != 0) | slid
         self._u[rows] = u[:n]
         for name, values in self._grasp.items():
             values[rows] = getattr(sim, name)[:n]

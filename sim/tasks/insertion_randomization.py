@@ -62,7 +62,8 @@ def insertion_randomization(name: str, task: InsertionTask) -> Randomization:
     if name not in RANDOMIZATIONS:
         raise UsageError(f"randomization must be one of {', '.join(RANDOMIZATIONS)}, got {name!r}")
     table = RANDOMIZATIONS[name]
-    return table if name == "nominal" else table.replace(grasp_height=task.part.grasp_height)
+    low, high = task.part.grasp_height
+    return table.replace(grasp_height=float(np.clip(0.0, low, high)) if name == "nominal" else (low, high))
 
 
 def simulator_parameters(sampled: Mapping[str, Array], *, elastic: bool) -> dict[str, Array]:

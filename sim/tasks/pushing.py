@@ -235,6 +235,11 @@ class Pushing(ControlTask):
         self._box_q = [scene.q(joint).start for joint in ("box_x", "box_y", "box_yaw")]
         # Column of the controls of `_ACTUATORS` for each actuator of the scene.
         self._order = np.argsort([scene.u(name) for name in _ACTUATORS])
+        limits = tuple(float(self.sim.param(f"{name}.force_upper")[0]) for name in _ACTUATORS[:3])
+        if any(scale > limit for scale, limit in zip(task.action_scale, limits, strict=True)):
+            raise UsageError(
+                f"action_scale must be within the limits of the actuators {limits}, got {task.action_scale}"
+            )
         self._gripper_base, self._box_base = (scene.bodies[scene.body(name)].pose.position for name in _BODIES)
         self._pad_center = scene.pads[0].pose.position  # in the frame of the gripper
         box = next(shape for shape in scene.shapes if shape.name == "box")

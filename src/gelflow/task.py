@@ -105,7 +105,7 @@ def _expected(field: "dataclasses.Field[Any]", value: Any) -> str | None:
     if isinstance(default, bool) or not isinstance(default, int | float):
         return None if default is None or isinstance(value, type(default)) else f"a {type(default).__name__}"
     if isinstance(default, int):
-        return None if _is_finite(value) and value == int(value) else "an integer"
+        return None if isinstance(value, numbers.Integral) and not isinstance(value, bool) else "an integer"
     return None if _is_finite(value) else "a finite number"
 
 
@@ -150,6 +150,8 @@ class InsertionTask(TaskDescription):
         self.check_not_negative("frame_depths", "action_scale", "workspace", "misalignment")
         if not self.frame_depths:
             raise UsageError("frame_depths must have at least one depth")
+        if any(start > limit * (1 + 1e-9) for start, limit in zip(self.misalignment, self.workspace, strict=True)):
+            raise UsageError(f"misalignment must be within the workspace {self.workspace}, got {self.misalignment}")
 
     def to_json(self) -> dict[str, Any]:
         """As plain data, without cuboid and flow map, so that it is that of checkpoints of earlier versions."""

@@ -66,6 +66,15 @@ def test_a_full_disk_leaves_no_images(name: str, tmp_path: Path, monkeypatch: py
     assert main(["render", "--out", str(tmp_path / name), "--frames", "3"]) == 0
 
 
+@pytest.mark.parametrize("name", ["images", "images.MJPEG"])
+def test_an_interrupted_rendering_leaves_no_images(name: str, tmp_path: Path) -> None:
+    written = write_sequence(GelSequence(make_appearance("clean", markers=63), "press", frames=3), tmp_path / name)
+    assert [next(written), next(written)] == [1, 2]
+    with pytest.raises(KeyboardInterrupt):
+        written.throw(KeyboardInterrupt)
+    assert [file for file in tmp_path.rglob("*") if file.is_file()] == []
+
+
 def test_existing_folders_are_not_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "mine.txt").write_text("mine")
     assert main(["render", "--out", str(tmp_path), "--frames", "1"]) == 2

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -19,7 +20,7 @@ from gelflow.observation import Grid
 from gelflow.perception.camera_calibration import load_calibration
 from gelflow.perception.frames import CameraMount
 from gelflow.perception.output.summary import TrackingSummary
-from gelflow.perception.output.writers import TrackedImage
+from gelflow.perception.output.writers import TrackedImage, TrackWriter, open_writer
 from gelflow.perception.sources import ImageSource, SourceImage
 from gelflow.perception.synthetic.appearance import GelAppearance
 from gelflow.perception.synthetic.fast_renderer import FastGelRenderer
@@ -141,6 +142,26 @@ def test_a_full_disk_is_an_error(name: str, tmp_path: Path) -> None:
     assert all(Path(file).stat().st_size for file in result["files"])
     assert all(file.stat().st_size for file in tmp_path.iterdir())
     assert name in run.stderr.splitlines()[-1]  # OpenCV writes warnings before
+
+
+@pytest.mark.parametrize("first", ["a.csv", "a.mcap", "a.png"])
+def test_a_file_that_cannot_be_created_leaves_none_of_the_others(
+    first: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def opened(file: Path, **options: Any) -> TrackWriter:
+        if file.name == "b.csv":
+            raise UsageError("b.csv cannot be created: No space left on device")
+        return open_writer(file, **options)
+
+    images, out = str(draw(tmp_path / "images", 2)), tmp_path / "out"
+    out.mkdir()
+    command = ["track", images, "--out", str(out / first), "--out", str(out / "b.csv")]
+    with monkeypatch.context() as patch:
+        patch.setattr("gelflow.cli.commands.track.open_writer", opened)
+        assert main(command) == 2
+    assert "No space left" in capsys.readouterr().err
+    assert list(out.iterdir()) == []
+    assert main(command) == 0
 
 
 def test_a_picture_that_cannot_be_written_leaves_no_calibration(

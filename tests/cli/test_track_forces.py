@@ -202,6 +202,19 @@ def test_forces_without_scale_or_gel_are_refused(
     assert [path.name for path in tmp_path.iterdir()] == ["gel.toml"]
 
 
+def test_forces_of_a_grid_with_two_spacings_are_refused(
+    images: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    wide = tmp_path / "wide.png"
+    image = cv2.imread(str(images / "images" / "0.jpg"))
+    assert image is not None
+    cv2.imwrite(str(wide), cv2.resize(image, (int(1.2 * image.shape[1]), image.shape[0])))
+    command = ["track", str(wide), "--pixels-per-mm", str(1.1 * LOOK.pixels_per_mm)]
+    assert main(command) == 0
+    assert main([*command, "--gel", str(images / "gel.toml")]) == 2
+    assert "forces need markers with one spacing" in capsys.readouterr().err
+
+
 @pytest.fixture(scope="module")
 def session(images: Path) -> Path:
     """A recorded run with those images of the left pad; its lab has a gel for this pad."""

@@ -259,3 +259,12 @@ def test_images_of_another_size_are_rejected() -> None:
     calibration = fitted(camera(MARKERS, barrel=0.0, keystone=0.0, center=(159.5, 119.5)))
     with pytest.raises(PeerError, match="images of 320 × 240 px, this one has 640 × 480"):
         calibration.check_size(np.zeros((480, 640, 3), dtype=np.uint8))
+
+
+def test_a_rectified_image_is_centred_on_the_grid() -> None:
+    middle = (np.array(SIZE) - 1) / 2
+    calibration = fitted(middle + MARKERS * 15)
+    distance = np.abs(np.arange(SIZE[0]) - middle[0]) / SIZE[0]
+    image = np.tile((500 * distance).astype(np.uint8), (SIZE[1], 1))
+    rectified = calibration.rectify(image).astype(int)
+    assert np.abs(rectified - rectified[:, ::-1]).max() <= 1

@@ -153,6 +153,7 @@ class InsertionRunner:
             ("start of an attempt", task.start_height, lab.arm.max_speed),
             ("end of an attempt", task.start_height - task.descent, lab.descent.speed),
             ("in the hole", lab.part.insert_to, lab.arm.max_speed),
+            ("back at the hand-over", lab.part.load_height, lab.arm.max_speed),
         ):
             target = self.pose(taught, height)
             supervisor.check(target, before, speed=speed, turn_speed=turn_speed)
@@ -348,6 +349,7 @@ class InsertionRunner:
         self._open()
 
     def _open(self) -> None:
+        self._motion.wait(0.0)  # raises where the gripper has reported a lost part meanwhile
         self._motion.expect_part(False)
         self._motion.wait(0.0)
         self._cell.gripper.release(width=self._lab.gripper.open_width, speed=self._lab.gripper.speed)
@@ -377,11 +379,13 @@ def _check_heights(lab: Lab, task: InsertionTask) -> None:
             f"the task descends by {deep:g} mm, descent.max_depth of the lab file allows {allowed:g} mm; raise it, "
             "or train with a smaller [descent] depth in the part file"
         )
-    if task.success_height - lab.part.insert_to <= lab.hole.height_error:
-        low, height, error = (1e3 * v for v in (lab.part.insert_to, task.success_height, lab.hole.height_error))
+    # Of contact that must not count as the floor: at the lowest rim, or of a part that is not inserted.
+    lowest = min(task.rim_height - lab.hole.height_error, task.success_height)
+    if lowest - lab.part.insert_to <= lab.hole.height_error:
+        low, height, error = (1e3 * v for v in (lab.part.insert_to, lowest, lab.hole.height_error))
         raise SafetyError(
-            f"contact at the rim and at the floor cannot be distinguished: part.insert_to is {low:g} mm, the part "
-            f"is inserted below {height:g} mm, and hole.height_error is {error:g} mm; reduce one of them"
+            f"contact at the rim and at the floor cannot be distinguished: the rim may be as low as {height:g} mm, "
+            f"part.insert_to is {low:g} mm and hole.height_error {error:g} mm; reduce one of these two"
         )
     highest = task.start_height + lab.hole.height_error  # of the start of an attempt, above the highest rim
     if lab.part.load_height <= highest:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 FORMAT = 1
 
 _DEFAULT_DENSITY = 1000.0  # [kg/m³]
-_HEAVIEST = 8.0  # [kg]; two pads hold 80 N at the largest grasp force (16 N) and friction (2.5) of the randomization
+_HEAVIEST = 2.5  # [kg]; two pads hold 28 N at the mean grasp force (9.25 N) and friction (1.5) of the randomization
 _MOST_ROTATIONS = 72
 _TABLES = ("format", "name", "part", "hole", "grasp", "descent", "misalignment", "symmetry")
 _PART_KEYS = {"box": ("size",), "cylinder": ("diameter", "height"), "mesh": ("file", "scale")}

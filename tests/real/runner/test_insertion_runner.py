@@ -32,7 +32,7 @@ from gelflow.real.runner.supervisor import Supervisor
 from gelflow.real.runner.touch.grasp_check import nominal_thresholds
 from gelflow.real.runner.touch.guarded_motion import Contact
 from gelflow.session.reader import SessionReader
-from gelflow.task import INSERTION
+from gelflow.task import INSERTION, insertion_task
 
 
 def test_part_is_inserted_and_the_run_is_recorded(robot: MockRobot, tmp_path: Path) -> None:
@@ -201,6 +201,28 @@ def test_a_hand_over_below_the_start_of_an_attempt_is_refused() -> None:
         parts: dict[str, Any] = {"policy": None, "motion": None, "operator": None}
         with pytest.raises(SafetyError, match=r"raise part\.load_height") if refused else nullcontext():
             InsertionRunner(cell, task=INSERTION, **parts)
+
+
+def test_a_hole_so_low_that_its_rim_could_be_the_floor_is_refused() -> None:
+    """Contact at a rim that is `height_error` lower than taught would count as the floor."""
+    cell: Any = SimpleNamespace(lab=EXAMPLE, clock=None, recorder=None)
+    parts: dict[str, Any] = {"policy": None, "motion": None, "operator": None}
+    for depth, refused in ((0.008, True), (0.010, True), (0.011, False)):
+        task = insertion_task(replace(INSERTION.part, depth=depth))
+        with pytest.raises(SafetyError, match="the rim may be as low as") if refused else nullcontext():
+            InsertionRunner(cell, task=task, **parts)
+
+
+def test_a_step_back_to_the_hand_over_is_checked_before_anything_moves() -> None:
+    """The arm rises there in one motion after a release, and with a part that is handed back."""
+    parts: dict[str, Any] = {"policy": None, "motion": None, "operator": None}
+    for height, refused in ((0.040, False), (0.055, True)):
+        lab = replace(EXAMPLE, part=replace(EXAMPLE.part, load_height=height))
+        cell: Any = SimpleNamespace(lab=lab, clock=None, recorder=None)
+        runner = InsertionRunner(cell, task=INSERTION, **parts)
+        before = runner.pose((0.0, 0.0, 0.0), height)
+        with pytest.raises(SafetyError, match="step 53 mm") if refused else nullcontext():
+            assert len(runner.check_plan(Supervisor(lab), before)) == 5
 
 
 def held_part(lab: Lab, height: float, move: Callable[..., Any]) -> HeldPart:

@@ -128,7 +128,12 @@ def test_a_saved_lab_file_with_any_name_is_read_back(tmp_path: Path) -> None:
         (
             "# speed = 0.02 ",
             "speed = 0.005 #",
-            "gripper.speed 0.005 m/s is too low: 50 mm take 10.5 s, and limits.gripper_motion is 6.0 s",
+            "gripper.speed 0.005 m/s is too low: 60 mm take 12.5 s, and limits.gripper_motion is 6.0 s",
+        ),
+        (
+            "# speed = 0.02 ",
+            "speed = 0.01 #",
+            "gripper.speed 0.01 m/s is too low: 60 mm take 6.5 s",
         ),
     ],
 )

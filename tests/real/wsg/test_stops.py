@@ -158,6 +158,26 @@ def test_a_stop_that_came_too_early_is_sent_again_after_the_pause(monkeypatch: p
         assert plant.gripper_state()[0] > 0.09
 
 
+def test_a_stop_that_is_not_confirmed_is_sent_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    with connected() as (gripper, _, _, record):
+        gripper.home()
+        link = gripper._link
+        assert link is not None
+        request, lost = link.request, [PeerTimeout("no answer")]
+
+        def damaged(packet: Packet, **options: Any) -> Any:
+            if packet.id == Command.STOP and lost:
+                raise lost.pop()
+            return request(packet, **options)
+
+        monkeypatch.setattr(link, "request", damaged)
+        gripper.stop()
+        assert record.names[-2:] == ["stop", "stop"]
+        lost += [PeerTimeout("second"), PeerTimeout("first")]
+        with pytest.raises(PeerTimeout, match="second"):
+            gripper.stop()
+
+
 def test_close_repeats_a_stop_that_was_not_confirmed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Although a part may be held, by the state from before the grasp."""
     with connected() as (gripper, _, plant, record):

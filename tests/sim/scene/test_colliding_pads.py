@@ -1,5 +1,6 @@
 """Colliding pads: the tactile forces sum to the contact wrench of the pad."""
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -114,6 +115,11 @@ def test_describe_and_invalid_values() -> None:
     described = describe(with_colliding_pads("insertion", "viscous"))
     assert all(pad.collides for pad in described.pads)
     assert described.size.contact_pairs > describe(load_scene("insertion")).size.contact_pairs
+    assert not any("viscous markers have no history" in line for line in described.not_modelled)
+    for scene, passes in ((load_scene("insertion"), True), (with_colliding_pads("insertion", "viscous"), False)):
+        without = describe(dataclasses.replace(scene, contacts=()))
+        line = next(line for line in without.not_modelled if "no collision" in line)
+        assert ("part and finger_left" in line) is passes
     with pytest.raises(UsageError, match="collides must be true or false"):
         load_scene("insertion", overrides={"pads.*.collides": 1})
     with pytest.raises(UsageError, match="unknown key 'pushes'; it is now called 'collides'"):

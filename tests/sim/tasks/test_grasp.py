@@ -157,6 +157,12 @@ def test_policy_may_choose_the_force() -> None:
         GraspTask(force_range=(4.0, 81.0))
 
 
+def test_a_start_beyond_the_workspace_is_refused() -> None:
+    batch = Grasp(1, threads=1)
+    with pytest.raises(UsageError, match=r"reset: start must be within the workspace of ±0\.11 m"):
+        batch.reset(batch.all, np.random.default_rng(0), options={"start": 0.12})
+
+
 def test_gripper_stays_on_the_bar_and_in_its_workspace() -> None:
     for blocks, limit in ((7, 0.075), (11, 0.11)):
         batch, rng = Grasp(1, blocks=blocks, threads=1, preset="fast"), np.random.default_rng(0)

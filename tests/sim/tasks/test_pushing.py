@@ -215,3 +215,8 @@ def test_bad_settings_are_named(make: Callable[[], object], message: str) -> Non
 def test_picture_of_the_box_and_its_goal() -> None:
     picture = started(1).render(0)
     assert picture.dtype == np.uint8 and picture.shape[2] == 3 and len(np.unique(picture.reshape(-1, 3), axis=0)) > 50
+
+
+def test_actions_beyond_the_limits_of_the_actuators_are_refused() -> None:
+    with pytest.raises(UsageError, match="action_scale must be within the limits of the actuators"):
+        Pushing(1, task=PushingTask(action_scale=(2.0, 1.0, 3.0)), threads=1)

@@ -24,7 +24,13 @@ from gelflow.perception.errors import TrackerInitError
 from gelflow.perception.force.image_forces import GridScale, ImageForces, grid_angle
 from gelflow.perception.force.recorded_pad import RecordedPad, recorded_pad
 from gelflow.perception.grid_detection.grid_part import Polarity
-from gelflow.perception.mount_check import VisiblePart, check_calibrated_scale, check_uniform_scale, find_visible_part
+from gelflow.perception.mount_check import (
+    VisiblePart,
+    check_calibrated_scale,
+    check_uniform_scale,
+    find_visible_part,
+    neighbour_spacing,
+)
 from gelflow.perception.output.forces import SUFFIX
 from gelflow.perception.output.init_error import picture_of_init_error
 from gelflow.perception.output.summary import TrackingSummary
@@ -37,6 +43,7 @@ from gelflow.session.records import software_versions
 if TYPE_CHECKING:
     from gelflow.view.tracking.tracking_page import TrackingPage
 
+_LARGEST_RATIO = 1.1  # of the spacings within rows and within columns, with forces
 _LARGEST_MAGNIFICATION = 1e6  # of the overlay's arrows
 
 
@@ -181,7 +188,9 @@ def _track(
         summary.pixels_per_mm = _scale(tracked, source, calibration, args)
         # Files are created after the first image: a failed start leaves no empty files.
         forces = _forces(tracked, calibration, summary.pixels_per_mm, args)
-        writers = [open_files.enter_context(closing(writer)) for writer in _writers(args, calibration, summary)]
+        with options.removed_on_error(*args.out), ExitStack() as created:
+            writers = [created.enter_context(closing(writer)) for writer in _writers(args, calibration, summary)]
+            open_files.enter_context(created.pop_all())
         writers += [] if page is None else [page]
         for number, frame in enumerate(itertools.islice(itertools.chain([first], images), args.images)):
             if number:
@@ -305,6 +314,7 @@ def _forces(
     if calibration is not None:
         grid = GridScale(calibration.spacing_mm, first.spacing / calibration.spacing_mm, along_grid=True)
     elif scale is not None:
+        _check_one_spacing(first)
         grid = GridScale(first.spacing / scale, scale)
     else:
         raise UsageError("--gel needs millimetres: give --calibration, --pixels-per-mm or a --profile with a pitch")
@@ -319,9 +329,20 @@ def _forces(
     return ImageForces(args.gel, first.rows, first.cols, grid, angle)
 
 
+def _check_one_spacing(first: TrackingResult) -> None:
+    """Raise UsageError when rows and columns differ in their spacing: the layer of the forces has one."""
+    in_row, in_column = neighbour_spacing(first.position, first.valid, first.rows, first.cols)
+    if max(in_row, in_column) > _LARGEST_RATIO * min(in_row, in_column):
+        raise UsageError(
+            f"neighbouring markers are {in_row:.1f} px apart in a row and {in_column:.1f} px in a column: forces need "
+            "markers with one spacing, seen from the front"
+        )
+
+
 def _writers(
     args: argparse.Namespace, calibration: CameraCalibration | None, summary: TrackingSummary
-) -> list[TrackWriter]:
+) -> Iterator[TrackWriter]:
+    """Opens the files of `--out` one after the other, so that each can be closed where the next one fails."""
     description = {
         "source": args.source,
         "profile": args.profile,
@@ -330,8 +351,8 @@ def _writers(
         "gel": None if args.gel is None else asdict(args.gel),
         "versions": software_versions(),
     }
-    return [
-        open_writer(
+    for file in args.out:
+        yield open_writer(
             file,
             sensor=args.sensor,
             magnify=args.magnify,
@@ -339,8 +360,6 @@ def _writers(
             millimetres=calibration is not None or summary.pixels_per_mm is not None,
             description=description,
         )
-        for file in args.out
-    ]
 
 
 def _tracked_image(

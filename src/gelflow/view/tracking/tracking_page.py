@@ -13,7 +13,7 @@ from gelflow.perception.output.writers import TrackedImage, overlay
 from gelflow.view.page import DEFAULT_HOST, DEFAULT_PORT, Page
 
 _SECONDS = 20.0  # of the curves
-_POINTS = 2000  # kept for the curves
+_POINTS = 20_000  # kept for the curves: 1000 images a second
 _PERIOD = 1 / 15  # between two pictures [s]
 _CURVE_PERIOD = 0.2  # between two curves [s]
 _MAX_SHARE = 0.25  # of the time that the page takes

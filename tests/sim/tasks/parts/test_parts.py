@@ -214,7 +214,7 @@ def test_a_soft_arm_presses_harder_in_a_deeper_descent() -> None:
         ('[part]\nshape = "cylinder"\ndiameter = 0.02\nheight = 0.05\n[hole]\nclearance = 0',
          "clearance must be above 0, got [0.0, 0.0]"),
         ('[part]\nshape = "cylinder"\ndiameter = 0.02\nheight = 0.05\nmass = 150\n[hole]\nclearance = 1e-3',
-         "part: the part weighs 150 kg; the gripper holds at most 8 kg"),
+         "part: the part weighs 150 kg; the gripper holds at most 2.5 kg"),
         ('[part]\nshape = "cylinder"\ndiameter = 0.02\nheight = 0.05\n[hole]\nclearence = 1e-3\nsides = 2',
          "unknown key 'clearence'; did you mean 'clearance'?"),
         ('[part]\nshape = "cylinder"\ndiameter = 0.02\nheight = 0.05\n[hole]\nsides = 2',
