@@ -4,7 +4,7 @@ import contextlib
 import dataclasses
 import json
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Generator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -38,7 +38,7 @@ def truth_file(images: Path) -> Path:
     return images.with_suffix(".npz") if images.suffix.lower() == VIDEO else images / TRUTH
 
 
-def write_sequence(sequence: GelSequence, out: Path) -> Iterator[int]:
+def write_sequence(sequence: GelSequence, out: Path) -> Generator[int, None, None]:
     """Renders `sequence` to `out`, a new folder or, with suffix .mjpeg, a video; yields the number of images written.
 
     The ground truth is written last. Raises UsageError when a file exists or cannot be written. Where a sequence is not

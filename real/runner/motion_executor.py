@@ -123,14 +123,20 @@ class MotionExecutor:
         return self._lab.gripper_pose(state.position, state.quaternion)
 
     def start_motion(
-        self, target: Pose, *, speed: float | None = None, turn_speed: float | None = None, guarded: bool = False
+        self,
+        target: Pose,
+        *,
+        speed: float | None = None,
+        turn_speed: float | None = None,
+        guarded: bool = False,
+        age: float = 0.0,
     ) -> None:
         """Start a straight motion of the gripper frame to `target` and return.
 
         Speeds [m/s], [rad/s]; None: those of the lab file. `guarded` states that the caller observes both pads until
-        the end of the motion, as `GuardedMotion` does, and calls `report_observation` each time. Raises SafetyError
-        when the supervisor refuses the target, when the phase allows no motion, and when a part is held and the motion
-        is not guarded; the arm then holds.
+        the end of the motion, as `GuardedMotion` does, and calls `report_observation` each time; `age` is that of their
+        images at the start [s]. Raises SafetyError when the supervisor refuses the target, when the phase allows no
+        motion, and when a part is held and the motion is not guarded; the arm then holds.
         """
         self._raise_failure()
         self.supervisor.phases.require_motion()
@@ -145,7 +151,7 @@ class MotionExecutor:
                     raise PartLost(self._part_lost)
                 self._post(target, speeds)
                 self._goal, self._speeds = target, speeds
-                self._observe_until = self._clock.now() + LONGEST_UNOBSERVED if guarded else math.inf
+                self._observe_until = self._next_observation(age) if guarded else math.inf
                 self._unobserved = False
         except SafetyError:
             self.hold()
@@ -161,8 +167,12 @@ class MotionExecutor:
         Returns False when the arm holds because this took too long: `start_motion` continues.
         """
         with self._lock:
-            self._observe_until = self._clock.now() + max(_LEAST_TIME, LIMITS.image_age - _HOLD_TIME - age)
+            self._observe_until = self._next_observation(age)
             return not self._unobserved
+
+    def _next_observation(self, age: float) -> float:
+        """Time until which the pads must be observed again, after an observation in images of this age [s]."""
+        return self._clock.now() + max(_LEAST_TIME, LIMITS.image_age - _HOLD_TIME - age)
 
     def hold(self) -> None:
         """Give up the target and come to rest; see `EgmArm.hold`."""

@@ -300,6 +300,13 @@ def test_the_command_counts_damaged_records(
     out = " ".join(capsys.readouterr().out.split())
     assert re.search(r"passed over: \d+ damaged records, 1 damaged chunks", out)
     assert re.search(r"[12] of 3 decisions (could not be recomputed|are lost)", out)
+    assert main(["recover", str(tmp_path / "damaged.mcap")]) == 0
+    capsys.readouterr()
+    # All decisions that are left may be identical.
+    assert main(["replay", str(tmp_path / "damaged.recovered.mcap"), "--json"]) == 1
+    assert json.loads(capsys.readouterr().out)["lost_chunks"] == 1
+    assert main(["replay", str(tmp_path / "damaged.recovered.mcap")]) == 1
+    assert "the session was recovered without 1 damaged chunks" in " ".join(capsys.readouterr().out.split())
 
 
 def test_the_command_rejects_wrong_input_with_one_line(

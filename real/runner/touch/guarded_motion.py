@@ -121,7 +121,7 @@ class GuardedMotion:
         speed = self.speed_towards(target) if speed is None else speed
         # A mock robot's time waits for this loop: on a busy computer the arm would travel on before an image is seen.
         with self._clock.bounded(RUNNER) as renew:
-            self._motion.start_motion(target, speed=speed, guarded=True)
+            self._start(target, speed)
             approach = self._motion.approach_monitor(target)
             while not self._motion.arrived(within=within):
                 renew()
@@ -133,16 +133,25 @@ class GuardedMotion:
                     if on_reading(reading) or change > threshold:
                         self._motion.hold()
                         return Contact(reading, change)
-                if self.observer.unreadable_time() >= LONGEST_UNOBSERVED:
+                age = self.observer.unreadable_time()
+                if age >= LONGEST_UNOBSERVED:
                     self._motion.hold()
-                    self._wait_until_readable()
-                    self._motion.start_motion(target, speed=speed, guarded=True)
+                    self._start(target, speed)
                     approach = self._motion.approach_monitor(target)
-                elif not self._motion.report_observation(self.observer.unreadable_time()):  # this thread was delayed
-                    self._motion.start_motion(target, speed=speed, guarded=True)
+                elif not self._motion.report_observation(age):  # this thread was delayed
+                    self._start(target, speed)
                 approach.check()
                 self._check_deadline(deadline)
         return None
+
+    def _start(self, target: Pose, speed: float) -> None:
+        """Start or continue a motion, after a hold until there are images that are new enough."""
+        if self.observer.unreadable_time() >= LONGEST_UNOBSERVED:
+            self.observer.update()  # this thread may have been delayed: newer images may have arrived
+        if self.observer.unreadable_time() >= LONGEST_UNOBSERVED:
+            self._motion.hold()
+            self._wait_until_readable()
+        self._motion.start_motion(target, speed=speed, guarded=True, age=self.observer.unreadable_time())
 
     def rest(self) -> TactileReading | None:
         """A reading of both pads at rest: the cameras are not synchronized, so pads in motion are inconsistent."""

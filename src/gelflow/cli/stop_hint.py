@@ -13,13 +13,15 @@ def hint_after_stop(error: str, lab: Path, *, moved: bool) -> str:
     `moved` states that motion may have begun: the gripper may be above or in the hole, with a part.
     """
     for words, action in (
-        (("FAST_STOP", "_FAULT", "BAD_CHECKSUM"), "acknowledge the gripper's fault with: gelflow robot acknowledge"),
+        (("FAST_STOP", "_FAULT"), "acknowledge the gripper's fault with: gelflow robot acknowledge"),
         (("not homed", "not referenced"), "home the gripper with: gelflow robot home"),
         (("holds a part", "part may be held", "a part is held"), "open the gripper with: gelflow robot open"),
     ):
         if any(word in error for word in words):
             return with_lab_option(action, lab)
-    return with_lab_option("raise the gripper with: gelflow robot jog z +10", lab) if moved else ""
+    if moved:
+        return with_lab_option("raise the gripper with: gelflow robot jog z +10", lab)
+    return "check the cable of the gripper, then start again" if "BAD_CHECKSUM" in error else ""
 
 
 def with_lab_option(text: str, lab: Path) -> str:

@@ -24,6 +24,8 @@ from gelflow.session.channels import JSON, PROTOBUF
 from gelflow.session.messages import READ_ERRORS, Damage, chunk_messages, expected_records, ordered_messages
 from gelflow.session.records import FORMAT, SENSORS, Decision
 
+RECOVERED = "gelflow recovered"  # name of the metadata of a recovered session
+
 
 @dataclass(frozen=True)
 class Record:
@@ -51,6 +53,7 @@ class SessionReader:
         self.path = Path(path)
         self.epoch = 0.0  # date of the robot time 0 as seconds since 1970; 0 in files that contain no dates
         self._epoch = 0  # the same [ns]
+        self.lost_chunks = 0  # damaged parts of the source of a recovered session, whose records are missing here
         self._stream: BinaryIO | None = None
         self._reader: SeekingReader | None = None
 
@@ -192,10 +195,11 @@ class SessionReader:
         return self._reader
 
     def _check_format(self, reader: SeekingReader) -> None:
-        for metadata in reader.iter_metadata():
-            if metadata.name == "gelflow":
-                self._take_metadata(metadata.metadata)
-                return
+        found = {metadata.name: metadata.metadata for metadata in reader.iter_metadata()}
+        if "gelflow" in found:
+            self.lost_chunks = int(found.get(RECOVERED, {}).get("damaged_chunks", "0"))
+            self._take_metadata(found["gelflow"])
+            return
         raise NotASession(f"{self.path} is an MCAP file but not a gelflow session; name a session recorded by gelflow")
 
     def _take_metadata(self, metadata: Mapping[str, str]) -> None:

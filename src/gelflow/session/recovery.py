@@ -22,7 +22,14 @@ from mcap.writer import MCAP0_MAGIC, Writer
 from gelflow import __version__
 from gelflow.errors import PeerError, UsageError
 from gelflow.session.messages import DECODE_ERRORS, READ_ERRORS
-from gelflow.session.reader import NotASession, SessionReader, is_being_recorded, is_finished, open_recording
+from gelflow.session.reader import (
+    RECOVERED,
+    NotASession,
+    SessionReader,
+    is_being_recorded,
+    is_finished,
+    open_recording,
+)
 from gelflow.session.recorder import CHUNK_BYTES
 
 _HEAD = struct.Struct("<BQ")  # opcode and length of a record
@@ -180,7 +187,7 @@ class _Copy:
 
     def finish(self, source: Path) -> None:
         lost = {"source": source.name, "lost_bytes": str(self.lost), "damaged_chunks": str(self.damaged)}
-        self._writer.add_metadata("gelflow recovered", lost)
+        self._writer.add_metadata(RECOVERED, lost)
         self._writer.finish()  # type: ignore[no-untyped-call]
         self._out.flush()
         os.fsync(self._out.fileno())

@@ -330,6 +330,12 @@ def test_a_guarded_motion_holds_when_its_caller_no_longer_observes_the_pads() ->
     assert arm.holds == 1 and not motion.report_observation(0.0)
     motion.start_motion(Pose(np.array([0.0, 0.0, 0.1]), np.array([1.0, 0.0, 0.0, 0.0])), guarded=True)
     assert motion.report_observation(0.0)
+    clock.seconds = 1.2  # with images that are 0.2 s old
+    motion.start_motion(Pose(np.array([0.0, 0.0, 0.1]), np.array([1.0, 0.0, 0.0, 0.0])), guarded=True, age=0.2)
+    for clock.seconds, held in ((1.24, False), (1.26, True)):
+        motion._hold_unobserved(clock.seconds)
+        assert arm.holds == 1 + held
+    motion.start_motion(Pose(np.array([0.0, 0.0, 0.1]), np.array([1.0, 0.0, 0.0, 0.0])), guarded=True)
     motion.hold()  # for another reason, such as a lost part: the motion does not continue
     assert motion.report_observation(0.0)
 

@@ -1,6 +1,7 @@
 """Physics and observations of simulated insertion attempts."""
 
 import dataclasses
+import math
 from typing import Any
 
 import numpy as np
@@ -81,7 +82,7 @@ def test_the_gripper_presses_with_the_largest_force_of_a_lab_file() -> None:
 def test_a_part_that_slides_out_of_the_grip_is_not_attempted() -> None:
     """Two pads hold 2 µ F: 5 N carry 0.5 kg and not 0.52 kg."""
     for mass, held_in_grip in ((0.5, True), (0.52, False)):
-        part = dataclasses.replace(INSERTION.part, density=mass / np.prod(INSERTION.part.size))
+        part = dataclasses.replace(INSERTION.part, density=mass / math.prod(INSERTION.part.size))
         weak = SILENT.replace(grasp_force=5.0, pad_mu=0.5)
         _, result = attempted(poses((3, 0, 0)), task=dataclasses.replace(INSERTION, part=part), randomization=weak)
         assert bool(result.failed[0]) is not held_in_grip

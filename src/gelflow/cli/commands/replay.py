@@ -59,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
         total, damage = session.counts().get("/decision", 0), Damage()
         comparisons = replay_with_progress(session, task, perception, policy, damage=damage)
         latencies = _latencies(session, description)
-    result = _Result(comparisons, total - len(comparisons), damage, notes, latencies)
+        result = _Result(comparisons, total - len(comparisons), damage, session.lost_chunks, notes, latencies)
     picture = args.out if comparisons else None
     if picture:
         from gelflow.session.decision_picture import draw_comparisons
@@ -87,6 +87,7 @@ class _Result:
     comparisons: Sequence[Comparison]
     lost: int  # decisions whose own record is damaged
     damage: Damage
+    lost_chunks: int  # of the source of a recovered session
     notes: list[str]
     latencies: list[list[LatencyEstimate]]  # of each camera, from each grasp
 
@@ -97,7 +98,8 @@ class _Result:
     @property
     def identical(self) -> bool:
         """Whether there is a decision and all were recomputed identically."""
-        return bool(self.comparisons) and not self.lost and all(c.identical for c in self.comparisons)
+        nothing_lost = not self.lost and not self.lost_chunks
+        return bool(self.comparisons) and nothing_lost and all(c.identical for c in self.comparisons)
 
     def verdict(self) -> list[str]:
         """Lines about all decisions together."""
@@ -119,6 +121,10 @@ class _Result:
             )
         if self.damage:
             lines.append(f"passed over: {self.damage.records} damaged records, {self.damage.chunks} damaged chunks")
+        if self.lost_chunks:
+            lines.append(
+                f"the session was recovered without {self.lost_chunks} damaged chunks, so decisions may be missing"
+            )
         if self.lost:
             lines.append(
                 f"{self.lost} of {count} decisions are lost with them; a policy with a memory has another state until "
@@ -193,6 +199,7 @@ def _show(output: Output, result: _Result, picture: Path | None) -> int:
             "skipped": len(result.skipped),
             "lost_decisions": result.lost,
             "damaged": dataclasses.asdict(result.damage),
+            "lost_chunks": result.lost_chunks,
             "latency": {
                 name: combine_latencies(estimates) for name, estimates in zip(SENSORS, result.latencies, strict=False)
             },
