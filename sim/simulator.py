@@ -246,6 +246,8 @@ class Simulator(StateArrays):
         At the present positions, or with another leading shape at `q` (…, N, nq), such as `Trajectory.q`. Raises
         UsageError for a scene without sites. Differentiable: `torch_site_poses`.
         """
+        if q is None:
+            self.step(np.zeros(self.model.nu), 0)  # no step: it sets the positions of coupled joints
         poses = site_poses(self.scene, self.model, self.params, self.q if q is None else q)
         return poses.astype(self.dtype, copy=False)
 

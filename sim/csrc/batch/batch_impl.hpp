@@ -187,6 +187,7 @@ void Batch<T>::error_estimate(const Controls<T>& u, T* out, std::int32_t* failur
 template <class T>
 void Batch<T>::kinematics(int env, Workspace<T>& w) {
   const StateView<T> s = state(env);
+  follow_leaders<T>(*model, s);
   forward_state<true, T>(*model, params_of(env), s.q, s.q_rounding, s.v, w);
 }
 
@@ -228,6 +229,7 @@ template <class T>
 void Batch<T>::read_one(int e, int thread, T* out, NonzeroMarkers* nonzero) {
   const StateView<T> s = state(e);
   Workspace<T>& w = memory_[thread].work;
+  follow_leaders<T>(*model, s);
   forward_state<false, T>(*model, params_of(e), s.q, s.q_rounding, s.v, w);
   read_markers<T>(*model, params_of(e), s.anchors, s.anchored, w, out, nonzero);
 }

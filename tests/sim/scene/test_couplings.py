@@ -1,5 +1,6 @@
 """Couplings of model files: joint equalities, <mimic>, fixed tendons, connect and weld, compared with MuJoCo."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -152,6 +153,25 @@ def test_positions_set_for_a_follower_are_those_of_its_leader(tmp_path: Path) ->
     sim.step(np.zeros((1, 1)))
     assert sim.q[0, 2] == pytest.approx(0.1 + 0.5 * sim.q[0, 0], abs=1e-15)
     assert sim.v[0, 2] == 0.5 * sim.v[0, 0]
+
+
+@pytest.mark.parametrize(
+    "read", [Simulator.poses, Simulator.site_poses, Simulator.mass_matrix, Simulator.bias, Simulator.contact_forces]
+)
+def test_readings_follow_the_leader_before_the_next_step(
+    read: Callable[[Simulator], np.ndarray], tmp_path: Path
+) -> None:
+    equality = '<joint joint1="rocker" joint2="crank" polycoef="0.1 0.5"/>'
+    scene = load(tmp_path, "loop.xml", LOOP.replace("EQUALITY", equality))
+    results = []
+    for steps in (None, 0):
+        sim = Simulator(scene)
+        sim.q[0], sim.v[0] = [0.4, 0.2, -3.0], [0.2, 0.1, 9.0]
+        if steps == 0:
+            sim.step(np.zeros(1), 0)
+        results.append(read(sim))
+        assert sim.q[0, 2] == 0.1 + 0.5 * 0.4
+    np.testing.assert_array_equal(*results)
 
 
 def test_description_lists_couplings(tmp_path: Path) -> None:
