@@ -145,7 +145,8 @@ class StreamCamera(ABC):
     def next(self, after: int, timeout: float) -> CameraImage:
         """The newest image with a `sequence` above `after`; waits up to `timeout` [s, robot time].
 
-        Images that were replaced by newer ones between two calls are skipped. Raises as `latest` does.
+        Images that were replaced by newer ones between two calls are skipped. An image that has arrived already is
+        returned however old it is, also of a stream that has ended: see its stamp. Without one, raises as `latest`.
         """
         with self._changed:
             self._raise_unopened()

@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 class FlowMapNoise:
     """Noise of real pads and cameras that the simulator does not model, sampled per part unless stated otherwise.
 
-    Lengths are relative to the longest vector of the flow map.
+    Lengths are relative to 1, the longest vector of a flow map with contact.
     """
 
     marker: float = 0.05  # largest standard deviation of marker vectors, sampled per attempt
