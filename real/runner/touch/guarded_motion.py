@@ -136,6 +136,7 @@ class GuardedMotion:
                 age = self.observer.unreadable_time()
                 if age >= LONGEST_UNOBSERVED:
                     self._motion.hold()
+                    self._wait_until_readable(age)
                     self._start(target, speed)
                     approach = self._motion.approach_monitor(target)
                 elif not self._motion.report_observation(age):  # this thread was delayed
@@ -150,7 +151,7 @@ class GuardedMotion:
             self.observer.update()  # this thread may have been delayed: newer images may have arrived
         if self.observer.unreadable_time() >= LONGEST_UNOBSERVED:
             self._motion.hold()
-            self._wait_until_readable()
+            self._wait_until_readable(0.0)
         self._motion.start_motion(target, speed=speed, guarded=True, age=self.observer.unreadable_time())
 
     def rest(self) -> TactileReading | None:
@@ -158,17 +159,18 @@ class GuardedMotion:
         self._motion.wait(_REST_TIME)
         return self.observer.update_pair(self._clock.now())
 
-    def _wait_until_readable(self) -> None:
+    def _wait_until_readable(self, unreadable: float) -> None:
         """Hold until both pads are readable again. Raises TouchLost after `limits.stale_frame`.
 
-        Late images may be readable and still too old, so the duration of the hold is limited as well.
+        `unreadable` [s] counts to this time: how long a pad in motion was not readable. Late images may be readable and
+        still too old, so the duration of the hold is limited as well.
         """
         phases = self._motion.supervisor.phases
         before = phases.phase
         phases.enter(Phase.HOLD)
         values = {"camera": self.observer.unreadable_camera, "seconds": self.observer.unreadable_time()}
         self._recorder.event("pad not readable", values)
-        begun = self._clock.now() - self.observer.unreadable_time()
+        begun = self._clock.now() - unreadable
         while self.observer.unreadable_time() >= LONGEST_UNOBSERVED:
             if (seconds := self._clock.now() - begun) > self._lab.limits.stale_frame:
                 raise TouchLost(
