@@ -67,15 +67,16 @@ def _draw_curves(axes: Any, variants: Sequence[Mapping[str, Any]], measure: str)
 
 
 def _draw_success(axes: Any, variants: Sequence[Mapping[str, Any]]) -> None:
-    """Success of each variant with its interval, seeds, and the figures to compare with."""
+    """Success of each variant with its deviation over the seeds, the seeds, and the figures to compare with."""
     for row, variant in enumerate(variants):
         ours = variant["ours"]
         at = 100 * ours["success"]
-        bounds = np.abs(100 * np.array([ours["success_95"]]).T - at)
+        deviation = 100 * (ours["success_deviation"] or 0)
         color = SERIES[0][0]
         seeds = [100 * value for value in ours["success_of_seeds"]]
         axes.scatter(seeds, np.full(len(seeds), row), marker="|", s=120, color=color, label=_once("ours, a seed", row))
-        axes.errorbar(at, row, xerr=bounds, fmt="o", color=color, capsize=4, label=_once("ours, 95 % interval", row))
+        label = _once("ours, mean and deviation", row)
+        axes.errorbar(at, row, xerr=deviation or None, fmt="o", color=color, capsize=4, label=label)
         if variant["paper"] is not None:
             spread = 100 * (variant["paper"]["spread"] or 0)
             known = axes.get_legend_handles_labels()[1]

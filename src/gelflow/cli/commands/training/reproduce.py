@@ -76,7 +76,7 @@ def _table(record: Mapping[str, Any]) -> Table:
 
     unit = length_of(record["variants"][0]["ours"])[0]
     table = Table(title=f"{record['task']}: success [%] ± deviation over the seeds, {unit} in parentheses")
-    last = "return" if record["curve"] == "reward" else "95 % interval"
+    last = "return" if record["curve"] == "reward" else "95 % of these\npolicies"
     for heading in ("variant", "ours", "paper", "oracle", "random", last, "min"):
         table.add_column(heading, justify="left" if heading == "variant" else "right")
     for variant in record["variants"]:
