@@ -308,7 +308,8 @@ class _Loop:
         if data is not None:
             link.put(data, now)
         for message in link.take(now):
-            self._udp.sendto(message, (self._config.host, self._config.port))
+            with suppress(OSError):  # a datagram that is too long is lost
+                self._udp.sendto(message, (self._config.host, self._config.port))
 
     def _wait_until(self, due: float) -> None:
         """Wait for the next cycle; robot time waits for late cycles and for the plant's answer.

@@ -82,7 +82,12 @@ def with_duplicates(scene: Scene) -> list[tuple[str, Simulator]]:
     for pad in scene.pads:
         what = "friction anchors of its markers" if pad.law == "elastic" else "viscous, not evaluated"
         both = replace(scene, pads=(*scene.pads, replace(pad, name=pad.name + _DUPLICATE)))
-        result.append((f"pad {pad.name}: {what}", Simulator(both, threads=1)))
+        sim = Simulator(both, threads=1)
+        if pad.collides:
+            what = "contact points and markers"
+            for number in _FORCE_PARAMS:
+                sim.param(f"{pad.name}{_DUPLICATE}.{number}")[:] = 0
+        result.append((f"pad {pad.name}: {what}", sim))
     return result
 
 

@@ -137,7 +137,7 @@ def _draw_legend(picture: Picture, drawing: SceneDrawing, view: View, scales: Fo
             _arrow(picture, corner, end, _INK, 1)
             _text(picture, name, (int(end[0] + 5 * right) - 3, int(end[1] - 8 * up) + 4))
     if any(geom.kind == "plane" for geom in drawing.geoms):
-        distance = quantity(1e3 * tile, "mm") if tile < 1 else quantity(tile, "m")
+        distance = f"{1e3 * tile:.3g} mm" if tile < 1 else f"{tile:.3g} m"
         _text(picture, f"lines {distance} apart", (76, height - 10))
     if drawing.contacts:
         size = _ARROW_SHARE * view.size[1]

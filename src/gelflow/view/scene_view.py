@@ -236,7 +236,9 @@ class SceneView:
 
 
 def _geometry_key(drawing: SceneDrawing) -> tuple[bytes, ...]:
-    return tuple(part.tobytes() for geom in drawing.geoms for part in (geom.size, geom.pose.position))
+    return tuple(
+        part.tobytes() for geom in drawing.geoms for part in (geom.size, geom.pose.position, geom.pose.quaternion)
+    )
 
 
 def _node(name: str) -> str:

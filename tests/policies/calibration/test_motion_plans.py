@@ -1,6 +1,7 @@
 """Plans of attempts: files, the information of attempts, and the covariance that plans and intervals rest on."""
 
 import dataclasses
+import functools
 from argparse import Namespace
 from pathlib import Path
 
@@ -227,8 +228,9 @@ def test_calibrate_refuses_contradicting_options(tmp_path: Path, capsys: pytest.
 
 @pytest.mark.slow
 def test_calibrate_writes_a_plan_within_the_workspace_of_the_lab(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("gelflow.cli.commands.calibrate.plan_motions", functools.partial(plan_motions, scenarios=2))
     example = Path(__file__).parents[3] / "real" / "runner" / "lab_example.toml"
     lab, plan = tmp_path / "lab.toml", tmp_path / "plan.toml"
     lab.write_text(example.read_text().replace("# x = 0.016 ", "x = 0.004 ").replace("# y = 0.016 ", "y = 0.004 "))

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.policies.calibration.recorded_world import LITTLE
 
 from gelflow.cli.main import main
 from gelflow.cli.session_replay import visible_markers
@@ -339,8 +340,10 @@ def test_the_report_is_written_where_the_output_cannot_be_printed(
 
 @pytest.mark.slow
 def test_the_command_writes_a_report_and_overwrites_nothing(
-    tmp_path: Path, world: RecordedWorld, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, world: RecordedWorld, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    little = dataclasses.replace(LITTLE, starts=2)  # in two processes
+    monkeypatch.setattr("gelflow.cli.commands.calibrate._QUICK", little)
     session, out = write_session(tmp_path / "a.mcap", world), tmp_path / "out"
     assert main(["calibrate", str(session), "--quick", "--out", str(out), "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)

@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 from tests.real.runner.harness import untrained_checkpoint
 
+import gelflow.real
+from gelflow.cli.commands import demo
 from gelflow.cli.main import main
 from gelflow.errors import PeerError, PeerTimeout
 from gelflow.mock_lab.robot_process import mock_robot, true_state
@@ -49,12 +51,12 @@ def test_a_timeout_of_a_demo_that_is_faster_than_real_time_names_a_remedy(
         raise PeerTimeout("the arm's pose is 1202 ms old, at most 1200 ms is allowed")
 
     monkeypatch.setattr(run_plan, "run_insertions", stall)
-    options = ["--quick", "--checkpoint", str(checkpoint), "--factor"]
-    assert main(["demo", "--out", str(tmp_path / "fast"), *options, "4"]) == 2
+    options = ["--quick", "--checkpoint", str(checkpoint), "--factor", "4"]
+    assert main(["demo", "--out", str(tmp_path / "fast"), *options]) == 2
     printed = " ".join(capsys.readouterr().err.split())
     assert "is allowed; delays of this computer are 4 times as long in robot time: close programs" in printed
-    assert main(["demo", "--out", str(tmp_path / "real"), *options, "1"]) == 2
-    assert "delays of this computer" not in capsys.readouterr().err
+    late = PeerTimeout("the arm's pose is 1202 ms old")
+    assert demo._explained(late, 1.0) is late
 
 
 def test_a_run_whose_output_is_closed_says_so(
@@ -66,20 +68,27 @@ def test_a_run_whose_output_is_closed_says_so(
         raise BrokenPipeError
 
     monkeypatch.setattr(run_plan, "run_insertions", closed)
-    with mock_robot(factor=FACTOR, seed=9) as (lab, _):
-        arguments = ["--lab", str(lab), "--checkpoint", str(checkpoint), "--out", str(tmp_path / "out")]
-        assert main(["run", "insertion", *arguments]) == 2
+    arguments = [
+        "--lab",
+        str(Path(gelflow.real.__path__[0]) / "runner" / "lab_example.toml"),
+        "--checkpoint",
+        str(checkpoint),
+        "--out",
+        str(tmp_path / "out"),
+    ]
+    assert main(["run", "insertion", *arguments]) == 2
     error = capsys.readouterr().err
     assert "standard output was closed, which stopped the run; raise the gripper with: gelflow robot jog" in error
 
 
 @pytest.mark.slow
 def test_demo_inserts_a_part_and_its_session_replays(
-    tmp_path: Path, checkpoint: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", "100")
+    monkeypatch.setattr(demo, "_EPISODES", 8)
     out = tmp_path / "demo"
-    options = ["--insertions", "1", "--factor", str(FACTOR), "--checkpoint", str(checkpoint), "--no-real-time"]
+    options = ["--insertions", "1", "--factor", str(FACTOR), "--no-real-time"]
     assert main(["demo", "--out", str(out), "--preset", "fast", *options]) == 0
     output = capsys.readouterr().out
     assert "misalignment" in output and f"gelflow replay {out / 'session.mcap'}" in output.replace("\n", "")

@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -44,30 +44,6 @@ def running(arguments: list[str], **streams: Any) -> Iterator["subprocess.Popen[
         process.wait()
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT])
-def test_signal_stops_the_arm_and_closes_everything(robot: MockRobot, tmp_path: Path, number: signal.Signals) -> None:
-    with running(command(robot, tmp_path), stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL) as process:
-        wait_for(lambda: moving(robot) or process.poll() is not None)
-        assert process.poll() is None, process.communicate()[1].decode()
-        sent = robot.clock.now()
-        process.send_signal(number)
-        time.sleep(0.02)
-        process.send_signal(number)  # a second signal does not break the shutdown
-        process.send_signal(signal.SIGINT)
-        _, errors = process.communicate(timeout=60)
-    assert process.returncode == 128 + number, errors.decode()
-    assert errors.decode() == f"gelflow run: ended by {number.name}\n"
-    recorded = events(tmp_path / "out" / "session.mcap")  # an unfinished file is refused
-    holds = [values["at"] for name, values in recorded if name == "arm hold" and values["at"] >= sent]
-    assert holds and number.name in dict(recorded)["arm stopped"]["reason"]
-    assert holds[0] - sent < 1.0, "robot time; 20 ms of wall time on a quiet computer"
-    assert not robot.gripper.fast_stopped
-    answers = robot.arm.report.answers
-    time.sleep(0.2)
-    assert robot.arm.report.answers == answers
-    assert robot.cell.truth()["part"]["phase"] == "gripped"
-
-
 class Terminal:
     """A real pty with what the program wrote to it."""
 
@@ -93,16 +69,49 @@ def terminal() -> Iterator[Terminal]:
     os.close(terminal.theirs)
 
 
-@pytest.mark.parametrize(
-    ("fault", "expected"),
-    [
-        (lambda robot: robot.arm.motors(False), "motors off"),
-        (lambda robot: robot.cameras[1].stall(), "camera right"),
-    ],
-    ids=["motors off", "frames stall"],
-)
+def run_until_a_signal(
+    robot: MockRobot, tmp_path: Path, number: signal.Signals, terminal: Terminal | None = None
+) -> None:
+    """Send `number` to a run that moves a part; with a terminal, Enter continues it before."""
+    presentation = {} if terminal is None else {"presentation": "prompt"}
+    stream = subprocess.DEVNULL if terminal is None else terminal.theirs
+    with running(command(robot, tmp_path, **presentation), stdin=stream, stdout=stream) as process:
+        if terminal is not None:
+            wait_for(lambda: terminal.shows("press Enter.") or process.poll() is not None)
+            terminal.type("\n")
+        wait_for(lambda: moving(robot) or process.poll() is not None)
+        assert process.poll() is None, process.communicate()[1].decode()
+        sent = robot.clock.now()
+        process.send_signal(number)
+        time.sleep(0.02)
+        process.send_signal(number)  # a second signal does not break the shutdown
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=60)
+    assert process.returncode == 128 + number, errors.decode()
+    assert errors.decode() == f"gelflow run: ended by {number.name}\n"
+    recorded = events(tmp_path / "out" / "session.mcap")  # an unfinished file is refused
+    holds = [values["at"] for name, values in recorded if name == "arm hold" and values["at"] >= sent]
+    assert holds and number.name in dict(recorded)["arm stopped"]["reason"]
+    assert holds[0] - sent < 1.0, "robot time; 20 ms of wall time on a quiet computer"
+    assert not robot.gripper.fast_stopped
+    answers = robot.arm.report.answers
+    time.sleep(0.2)
+    assert robot.arm.report.answers == answers
+    assert robot.cell.truth()["part"]["phase"] == "gripped"
+
+
+def test_signal_stops_the_arm_and_closes_everything(robot: MockRobot, tmp_path: Path) -> None:
+    run_until_a_signal(robot, tmp_path, signal.SIGHUP)
+
+
+def test_a_signal_after_enter_stops_the_arm_and_closes_everything(
+    robot: MockRobot, tmp_path: Path, terminal: Terminal
+) -> None:
+    run_until_a_signal(robot, tmp_path, signal.SIGTERM, terminal)
+
+
 def test_fault_while_the_operator_is_asked_ends_the_run_at_once(
-    robot: MockRobot, tmp_path: Path, terminal: Terminal, fault: Callable[[MockRobot], None], expected: str
+    robot: MockRobot, tmp_path: Path, terminal: Terminal
 ) -> None:
     arguments = command(robot, tmp_path, presentation="prompt")
     with running(arguments, stdin=terminal.theirs, stdout=terminal.theirs) as process:
@@ -110,24 +119,12 @@ def test_fault_while_the_operator_is_asked_ends_the_run_at_once(
             lambda: terminal.shows("Hold part 1 between the fingers, then press Enter.") or process.poll() is not None
         )
         assert process.poll() is None, process.communicate()[1].decode()
-        fault(robot)
+        robot.arm.motors(False)
         _, errors = process.communicate(timeout=60)  # Enter is never pressed
     assert process.returncode == 2
-    assert expected in errors.decode() and errors.decode().count("\n") == 1
+    assert "motors off" in errors.decode() and errors.decode().count("\n") == 1
     assert f"gelflow robot jog z +10 --lab {tmp_path / 'lab.toml'}" in errors.decode()
-    assert expected in dict(events(tmp_path / "out" / "session.mcap"))["stopped"]["reason"]
-
-
-def test_enter_continues_the_run(robot: MockRobot, tmp_path: Path, terminal: Terminal) -> None:
-    arguments = command(robot, tmp_path, presentation="prompt")
-    with running(arguments, stdin=terminal.theirs, stdout=terminal.theirs) as process:
-        wait_for(lambda: terminal.shows("press Enter.") or process.poll() is not None)
-        terminal.type("\n")
-        wait_for(lambda: moving(robot) or process.poll() is not None)
-        assert process.poll() is None, process.communicate()[1].decode()
-        process.send_signal(signal.SIGTERM)
-        process.communicate(timeout=60)
-    assert process.returncode == 143
+    assert "motors off" in dict(events(tmp_path / "out" / "session.mcap"))["stopped"]["reason"]
 
 
 def test_prompt_with_closed_standard_input_ends_the_run(robot: MockRobot, tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -124,7 +125,7 @@ def test_a_requested_stop_holds_the_arm_at_once_and_ends_the_run(robot: MockRobo
 
 
 def test_a_stop_before_the_first_motion_moves_nothing(robot: MockRobot, tmp_path: Path) -> None:
-    before = robot.cell.arm_pose()[0]
+    before, width = robot.cell.arm_pose()[0], robot.cell.gripper_state()[0]
 
     def stop(motion: MotionExecutor) -> None:
         motion.request_stop("the operator pressed stop")
@@ -132,6 +133,7 @@ def test_a_stop_before_the_first_motion_moves_nothing(robot: MockRobot, tmp_path
     with pytest.raises(SafetyError, match="the operator pressed stop"):
         run_insertions(plan_for(robot, tmp_path, OraclePolicy(robot), on_motion=stop))
     assert robot.cell.arm_pose()[0] == pytest.approx(before, abs=1e-9)
+    assert robot.cell.gripper_state()[0] == pytest.approx(width, abs=1e-4)  # the fingers were not homed
 
 
 def test_a_stop_at_the_hand_over_does_not_close_the_fingers(
@@ -152,22 +154,11 @@ def test_a_stop_at_the_hand_over_does_not_close_the_fingers(
     assert robot.cell.gripper_state()[0] == pytest.approx(plan.lab.gripper.open_width, abs=1e-3)
 
 
-def test_a_stop_before_the_preflight_ends_homes_no_fingers(robot: MockRobot, tmp_path: Path) -> None:
-    width = robot.cell.gripper_state()[0]
-    with pytest.raises(SafetyError, match="the operator pressed stop"):
-        run_insertions(
-            plan_for(
-                robot, tmp_path, OraclePolicy(robot), on_motion=lambda m: m.request_stop("the operator pressed stop")
-            )
-        )
-    assert robot.cell.gripper_state()[0] == pytest.approx(width, abs=1e-4)
-
-
 @pytest.mark.slow
 def test_slow_disk_stops_the_arm(robot: MockRobot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A record may be late by 2 s (wall); each fsync takes 5 s once the part moves, and no time before."""
-    seconds = 0.0
-    monkeypatch.setattr(os, "fsync", lambda descriptor: time.sleep(seconds))
+    """A record may be late by 2 s (wall); an fsync takes up to 5 s once the part moves, and no time before."""
+    seconds, ended = 0.0, threading.Event()
+    monkeypatch.setattr(os, "fsync", lambda descriptor: ended.wait(seconds))
     lab = lab_for(robot)
     lab = replace(lab, limits=replace(lab.limits, recording_delay=2.0 * robot.clock.factor))
     plan = plan_for(robot, tmp_path, OraclePolicy(robot), lab=lab)
@@ -175,6 +166,8 @@ def test_slow_disk_stops_the_arm(robot: MockRobot, tmp_path: Path, monkeypatch: 
     wait_for(lambda: moving(robot), during=finish)
     seconds = 5.0
     begun = robot.clock.now()
+    wait_for(lambda: robot.arm.report.state == "ended", during=None)
+    ended.set()
     # The error of the recording, or that of the next motion, which the latch refuses for the same reason.
     with pytest.raises(GelflowError, match=r"is \d\.\d s behind, at most 2 s is allowed; is the disk full or slow\?"):
         finish()

@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 from gelflow.errors import UsageError
 from gelflow.sim import _core
 from gelflow.sim.benchmark.describe import describe
+from gelflow.sim.benchmark.step_times import with_duplicates
 from gelflow.sim.scene import FRICTION_LAWS, Scene, load_scene
+from gelflow.sim.scene.start_controls import holding_controls
 from gelflow.sim.simulator import Simulator
 from gelflow.sim.validation import gradient_check
 from gelflow.sim.validation.energy import EnergyGauge
@@ -109,6 +111,17 @@ def test_colliding_pads_share_parameters_and_anchors_with_their_contacts() -> No
     assert not np.array_equal(sim.v[0], sim.v[1]), "the parameter of the pad affects the motion"
     gauge = EnergyGauge(scene, num_envs=2)
     assert np.isfinite(gauge.read(sim).total).all()
+
+
+@pytest.mark.parametrize("law", FRICTION_LAWS)
+def test_step_times_are_those_of_the_same_motion(law: str) -> None:
+    scene = with_colliding_pads("insertion", law)
+    u = holding_controls(scene)
+    alone = Simulator(scene, threads=1)
+    alone.step(u, 40)
+    for name, twice in with_duplicates(scene):
+        twice.step(u, 40)
+        np.testing.assert_array_equal(twice.q, alone.q, err_msg=name)
 
 
 def test_describe_and_invalid_values() -> None:

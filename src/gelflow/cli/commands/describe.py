@@ -109,7 +109,7 @@ def _add_body(at: Tree, body: "BodyPart") -> None:
 
 
 def _joint(joint: "JointPart") -> str:
-    angle = joint.type == "hinge"
+    angle = joint.type in ("hinge", "ball")
     unit, per = ("rad", "N m/rad") if angle else ("m", "N/m")
     words = [joint.type]
     if joint.prescribed:
@@ -120,7 +120,8 @@ def _joint(joint: "JointPart") -> str:
         low, high = joint.range
         words.append(f"range {low:g} to {high:g} {unit} (stop {joint.limit_stiffness:g} {per})")
     if joint.damping:
-        words.append(f"damping {joint.damping:g}" + (f" {'N m s/rad' if angle else 'N s/m'}" if joint.axis else ""))
+        of_all = "" if joint.type == "free" else " N m s/rad" if angle else " N s/m"
+        words.append(f"damping {joint.damping:g}{of_all}")
     if joint.stiffness:
         words.append(f"spring {joint.stiffness:g} {per}")
     if joint.frictionloss:

@@ -112,7 +112,8 @@ def _wait_for_end(*, attached: bool) -> None:
 
     if attached:
         threading.Thread(target=wait_for_end_of_input, daemon=True).start()
-    signals = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    # Signals that were ignored, as by nohup, stay ignored.
+    signals = [n for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP) if signal.getsignal(n) != signal.SIG_IGN]
     before = {number: signal.signal(number, end) for number in signals}
     try:
         while not ending.wait(0.5):

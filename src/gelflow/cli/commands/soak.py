@@ -93,7 +93,7 @@ def _run_promises(args: argparse.Namespace) -> int:
     result = to_json(rows)
     output.text(f"{sum(row.held for row in rows)} of {len(rows)} promises held; load {result['load']}")
     output.result(result)
-    write_json(args.out / "promises.json", result)
+    write_json(args.out / ("promises.json" if args.only is None else f"promises-{args.only}.json"), result)
     return SUCCESS if all(row.held for row in rows) else NEGATIVE_RESULT
 
 
