@@ -142,6 +142,11 @@ class MockRobot:
             self._stack = stack.pop_all()
         return self
 
+    @property
+    def running(self) -> bool:
+        """Whether both processes of the robot run, those of the simulated cell and of the arm's controller."""
+        return self.cell.running and self.arm.running
+
     def stop(self) -> None:
         """Stop all devices and the cell. Raises errors that occurred inside a mock."""
         self._stack.close()

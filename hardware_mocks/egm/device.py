@@ -81,6 +81,11 @@ class MockEgmArm:
         return self._call("report")
 
     @property
+    def running(self) -> bool:
+        """Whether the process of the controller runs."""
+        return self._helper is not None and self._helper.running
+
+    @property
     def pid(self) -> int | None:
         """Process id of the controller; None when it is not running."""
         return None if self._helper is None else self._helper.pid

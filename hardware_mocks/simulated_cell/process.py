@@ -105,6 +105,11 @@ class SimulatedCellProcess:
             raise
         return self
 
+    @property
+    def running(self) -> bool:
+        """Whether the process runs."""
+        return self._helper is not None and self._helper.running
+
     def stop(self) -> None:
         """End the process. Raises SimulationError when it had failed before."""
         helper, self._helper = self._helper, None

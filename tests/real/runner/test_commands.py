@@ -1,17 +1,20 @@
 """`gelflow mock`, `run`, `demo` and `replay` as command lines, with the mock robot in a separate process."""
 
 import json
+import os
+import signal
 import socket
 import urllib.request
 from pathlib import Path
 
 import pytest
-from tests.real.runner.harness import untrained_checkpoint
+from tests.real.runner.harness import free_port, untrained_checkpoint
 
 import gelflow.real
 from gelflow.cli.commands import demo
 from gelflow.cli.main import main
 from gelflow.errors import PeerError, PeerTimeout
+from gelflow.hardware_mocks.robot import MockRobot
 from gelflow.mock_lab.robot_process import mock_robot, true_state
 from gelflow.real.runner import run_plan
 from gelflow.real.runner.lab_file import load_lab
@@ -97,6 +100,23 @@ def test_demo_inserts_a_part_and_its_session_replays(
     assert picture.read_bytes()[:4] == b"\x89PNG" and picture.stat().st_size > 50_000
     assert main(["replay", str(out / "session.mcap")]) == 0
     assert "decisions identical; largest difference: action 0" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_mock_robot_ends_with_one_of_its_processes(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    started = MockRobot.start
+
+    def start(robot: MockRobot) -> MockRobot:
+        started(robot)
+        assert robot.running and robot.arm.pid is not None
+        os.kill(robot.arm.pid, signal.SIGKILL)
+        return robot
+
+    monkeypatch.setattr(MockRobot, "start", start)
+    assert main(["mock", "--egm-port", str(free_port(socket.SOCK_DGRAM))]) == 2
+    error = capsys.readouterr().err
+    assert "the mock controller's process has ended" in error and error.count("\n") == 1
 
 
 def test_mock_reports_why_it_cannot_start(capsys: pytest.CaptureFixture[str]) -> None:

@@ -171,7 +171,7 @@ def test_readings_follow_the_leader_before_the_next_step(
             sim.step(np.zeros(1), 0)
         results.append(read(sim))
         assert sim.q[0, 2] == 0.1 + 0.5 * 0.4
-    np.testing.assert_array_equal(*results)
+    np.testing.assert_array_equal(results[0], results[1])
 
 
 def test_description_lists_couplings(tmp_path: Path) -> None:

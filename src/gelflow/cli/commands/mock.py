@@ -82,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
         if args.out is not None:
             save_lab(lab_for(robot, jitter=args.jitter), args.out, title=_LAB_TITLE)
         _show(Output(args.json), robot, args.out)
-        _wait_for_end(attached=args.attached)
+        _wait_for_end(robot, attached=args.attached)
     return SUCCESS
 
 
@@ -99,7 +99,8 @@ def _check_replaceable(path: Path) -> None:
         raise UsageError(f"{path} exists, and gelflow mock did not write it; name another file with --out")
 
 
-def _wait_for_end(*, attached: bool) -> None:
+def _wait_for_end(robot: "MockRobot", *, attached: bool) -> None:
+    """Wait for Ctrl-C, or until a process of the robot has ended; `MockRobot.stop` then raises the reason."""
     ending = threading.Event()
 
     def end(number: int, frame: FrameType | None) -> None:
@@ -116,7 +117,7 @@ def _wait_for_end(*, attached: bool) -> None:
     signals = [n for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP) if signal.getsignal(n) != signal.SIG_IGN]
     before = {number: signal.signal(number, end) for number in signals}
     try:
-        while not ending.wait(0.5):
+        while robot.running and not ending.wait(0.5):
             pass
     finally:
         for number, handler in before.items():
