@@ -1,11 +1,13 @@
 """The mock robot: gripper, arm and two tactile cameras on the wire, with one simulated cell as their plant."""
 
 import contextlib
+import fcntl
 import json
 import math
 import os
 import tempfile
 import threading
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -127,6 +129,7 @@ class MockRobot:
         """Start the simulated cell, then the devices. Raises UsageError when a port is in use."""
         with contextlib.ExitStack() as stack:
             stack.callback(self._folder.cleanup)
+            stack.enter_context(_only_sender(self.config.egm_port))
             self.cell.start()
             stack.callback(self.cell.stop)
             self.arm.start()
@@ -156,6 +159,23 @@ class MockRobot:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
         self.stop()
+
+
+@contextlib.contextmanager
+def _only_sender(port: int) -> Iterator[None]:
+    """Raise UsageError where another mock robot of this user sends to the UDP port `port`.
+
+    A driver takes the first arm that sends to its port for the robot.
+    """
+    folder = _memory_folder() or tempfile.gettempdir()
+    with Path(folder, f"gelflow-egm-{os.getuid()}-{port}.lock").open("a") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise UsageError(
+                f"another mock robot sends to the UDP port {port}: end it, or name another port with --egm-port"
+            ) from None
+        yield
 
 
 def _memory_folder() -> str | None:

@@ -13,7 +13,7 @@ from tests.real.runner.harness import free_port, untrained_checkpoint
 import gelflow.real
 from gelflow.cli.commands import demo
 from gelflow.cli.main import main
-from gelflow.errors import PeerError, PeerTimeout
+from gelflow.errors import PeerError, PeerTimeout, UsageError
 from gelflow.hardware_mocks.robot import MockRobot
 from gelflow.mock_lab.robot_process import mock_robot, true_state
 from gelflow.real.runner import run_plan
@@ -110,6 +110,8 @@ def test_a_mock_robot_ends_with_one_of_its_processes(
     def start(robot: MockRobot) -> MockRobot:
         started(robot)
         assert robot.running and robot.arm.pid is not None
+        with pytest.raises(UsageError, match="another mock robot sends to the UDP port"):
+            started(MockRobot(1.0, robot.config))
         os.kill(robot.arm.pid, signal.SIGKILL)
         return robot
 
