@@ -55,8 +55,7 @@ def read_recordings(
                 visible = visible_markers(described)
             setup = setup or present
             present.check(path, setup, paths[0])
-            name = f"{path.stem}, " if len(paths) > 1 else ""
-            found, entered = _attempts(path, session, number, name, present.task)
+            found, entered = _attempts(path, session, number, f"{path.stem}, " * (len(paths) > 1), present.task)
         planned += [described.get("checkpoint") is None] * len(found)
         rows += found
         inserted |= entered

@@ -66,7 +66,7 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     [
         (TRADEOFF, "a.png", "scene"),
         (BENCH, "bench.json", "format"),
-        (PROMISES, "promises.json", "promises"),
+        (PROMISES, "promises-contact.json", "promises"),
         (EGM, "egm.json", "missed"),
     ],
 )
@@ -95,7 +95,7 @@ def test_a_fit_is_printed_where_the_report_or_the_plan_fails(
     plan = Plan((PlannedMotion(3e-3, 0.0, 0.0, 1e-3),), (1.5,), {})
     replaced: dict[str, Any] = {
         **{"read_attempts": recordings, "plan_motions": plan, "plain_report": {"attempts": {}}, "page": ""},
-        **{"calibrate": SimpleNamespace(fit=None, recordings=recordings), "write_scene": [], target: None},
+        **{"calibrate": SimpleNamespace(known=None, recordings=recordings), "write_scene": [], target: None},
     }
 
     def replace(name: str) -> Any:

@@ -19,7 +19,7 @@ _STEP = 0.2  # of differences in parameters and start heights, in standard devia
 
 @dataclass(frozen=True)
 class Known:
-    """What is known of the whitened parameters: a normal distribution, and the drift of the pads [N]."""
+    """Knowledge about the whitened parameters: a normal distribution, and the drift of the pads [N]."""
 
     mean: Array
     covariance: Array

@@ -31,7 +31,7 @@ def test_dry_run_sends_no_motion(robot: MockRobot, tmp_path: Path) -> None:
         result = dry_run(plan_for(robot, tmp_path, OraclePolicy(robot), lab=lab))
     finally:
         relay.close()
-    assert [item.good for item in result.items] == [True] * 5 and len(result.targets) == 4
+    assert [item.good for item in result.items] == [True] * 5 and len(result.targets) == 5
     assert np.isfinite(result.correction).all()
     packets = Decoder(plausible=plausible_request).feed(relay.sent)
     assert packets and all(isinstance(packet, Packet) for packet in packets)
