@@ -110,7 +110,7 @@ class Calibration:
 
     @property
     def known(self) -> Known | None:
-        """Distribution of the parameters that plans start from; None: the priors, because the fit is not good enough."""
+        """Distribution of the parameters that plans start from; None: the priors, since the fit is not good enough."""
         return _known(self.parameters, self.fit, predicted=self.predicted is not False)
 
     @property
