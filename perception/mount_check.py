@@ -68,6 +68,16 @@ def check_scale(mount: CameraMount, rest: TrackingResult) -> None:
     )
 
 
+def check_one_spacing(rest: TrackingResult) -> None:
+    """Raise UsageError when the spacings of the markers within rows and within columns differ by more than 10 %."""
+    in_row, in_column = neighbour_spacing(rest.position, rest.valid, rest.rows, rest.cols)
+    if max(in_row, in_column) > (1 + TOLERANCE) * min(in_row, in_column):
+        raise UsageError(
+            f"neighbouring markers are {in_row:.1f} px apart in a row and {in_column:.1f} px in a column: forces need "
+            "markers with one spacing, seen from the front"
+        )
+
+
 def check_uniform_scale(pixels_per_mm: float, spacing: float, pitch: float = 0.0) -> None:
     """Raise UsageError when the spacing of the markers [px] by a uniform scale is impossible, or not the pitch [mm].
 

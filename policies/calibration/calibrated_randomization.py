@@ -24,7 +24,7 @@ from gelflow.task import InsertionTask
 Array = NDArray[np.float64]
 
 SAMPLES = 256
-_DRAWS = 64 * SAMPLES  # of which those within the limit are used
+_DRAWS = 64 * SAMPLES  # points from the joint distribution; the first `SAMPLES` within the limits are used
 _LIMIT = 3**0.5  # of a whitened parameter [sd]: three times the range of a randomization that is the prior
 _NOISE = 2.0  # factor by which the estimate of the noise may be wrong
 _DIGITS = 5  # significant

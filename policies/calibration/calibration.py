@@ -1,6 +1,6 @@
 """A calibration: parameters with intervals, errors on insertions that were not fitted, and what to record next."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -111,7 +111,7 @@ class Calibration:
     @property
     def known(self) -> Known | None:
         """Distribution of the parameters that plans start from; None: the priors, since the fit is not good enough."""
-        return _known(self.parameters, self.fit, predicted=self.predicted is not False)
+        return _known(self.estimates, self.fit)
 
     @property
     def explained(self) -> bool | None:
@@ -174,15 +174,15 @@ def calibrate(
         other.allow_for(drift=result.best.drift)
         found = find_poses(other, point, rng)
         held_out, residual = _flow_maps(other, found, rng), other.errors.chi(other.residuals(*found)[0])
-    predicted = _predicted(residual) is not False
+    estimates = _estimates(problem.fitted, result, predicted=_predicted(residual) is not False)
     return Calibration(
-        _estimates(problem.fitted, result, predicted=predicted),
+        estimates,
         _pairs(problem.fitted, result),
         _flow_maps(problem, (result.best.point, result.best.misalignment), rng),
         held_out,
         residual,
         recordings,
-        tuple(suggest(problem, _known(problem.fitted, result, predicted=predicted))),
+        tuple(suggest(problem, _known(estimates, result))),
         result,
     )
 
@@ -219,16 +219,14 @@ def _estimates(fitted: tuple[Parameter, ...], result: FitResult, *, predicted: b
     )
 
 
-def _known(fitted: tuple[Parameter, ...], result: FitResult, *, predicted: bool) -> Known | None:
-    """The joint distribution of the parameters that are confirmed, with the priors of the others; None: of all."""
-    if not (result.converged and _reproduced(result)):
+def _known(estimates: Sequence[Estimate], result: FitResult) -> Known | None:
+    """The joint distribution of the confirmed parameters, with the priors of the others; None: none is confirmed."""
+    unknown = np.array([not estimate.confirmed for estimate in estimates[: result.count]])
+    if unknown.all():
         return None
     mean, covariance = result.joint_distribution
-    if not predicted:
-        unknown = np.array([p.name in QUANTITIES for p in fitted])
-        mean = np.where(unknown, 0.0, mean)
-        covariance = np.where(unknown[:, None] | unknown, np.eye(len(fitted)), covariance)
-    return Known(mean, covariance, result.best.drift)
+    covariance = np.where(unknown[:, None] | unknown, np.eye(result.count), covariance)
+    return Known(np.where(unknown, 0.0, mean), covariance, result.best.drift)
 
 
 def _pairs(fitted: tuple[Parameter, ...], result: FitResult) -> tuple[tuple[str, str, float], ...]:

@@ -166,7 +166,7 @@ def test_slow_disk_stops_the_arm(robot: MockRobot, tmp_path: Path, monkeypatch: 
     wait_for(lambda: moving(robot), during=finish)
     seconds = 5.0
     begun = robot.clock.now()
-    wait_for(lambda: robot.arm.report.state == "ended", during=None)
+    wait_for(lambda: robot.arm.report.state == "ended")
     ended.set()
     # The error of the recording, or that of the next motion, which the latch refuses for the same reason.
     with pytest.raises(GelflowError, match=r"is \d\.\d s behind, at most 2 s is allowed; is the disk full or slow\?"):

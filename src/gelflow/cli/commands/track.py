@@ -27,9 +27,9 @@ from gelflow.perception.grid_detection.grid_part import Polarity
 from gelflow.perception.mount_check import (
     VisiblePart,
     check_calibrated_scale,
+    check_one_spacing,
     check_uniform_scale,
     find_visible_part,
-    neighbour_spacing,
 )
 from gelflow.perception.output.forces import SUFFIX
 from gelflow.perception.output.init_error import picture_of_init_error
@@ -43,7 +43,6 @@ from gelflow.session.records import software_versions
 if TYPE_CHECKING:
     from gelflow.view.tracking.tracking_page import TrackingPage
 
-_LARGEST_RATIO = 1.1  # of the spacings within rows and within columns, with forces
 _LARGEST_MAGNIFICATION = 1e6  # of the overlay's arrows
 
 
@@ -314,7 +313,7 @@ def _forces(
     if calibration is not None:
         grid = GridScale(calibration.spacing_mm, first.spacing / calibration.spacing_mm, along_grid=True)
     elif scale is not None:
-        _check_one_spacing(first)
+        check_one_spacing(first)
         grid = GridScale(first.spacing / scale, scale)
     else:
         raise UsageError("--gel needs millimetres: give --calibration, --pixels-per-mm or a --profile with a pitch")
@@ -327,16 +326,6 @@ def _forces(
         )
     angle = grid_angle(first.position, first.rows, first.cols)
     return ImageForces(args.gel, first.rows, first.cols, grid, angle)
-
-
-def _check_one_spacing(first: TrackingResult) -> None:
-    """Raise UsageError when rows and columns differ in their spacing: the layer of the forces has one."""
-    in_row, in_column = neighbour_spacing(first.position, first.valid, first.rows, first.cols)
-    if max(in_row, in_column) > _LARGEST_RATIO * min(in_row, in_column):
-        raise UsageError(
-            f"neighbouring markers are {in_row:.1f} px apart in a row and {in_column:.1f} px in a column: forces need "
-            "markers with one spacing, seen from the front"
-        )
 
 
 def _writers(
