@@ -72,6 +72,7 @@ class HeldPart:
         self.thresholds = check.thresholds
         self.height_offset = 0.0
         self._slip = 0.0
+        self._start_z = 0.0  # of the gripper at the start of the last descent, base frame [m]
         self._deadline = math.inf
         self._grasp_observer = observer  # its reference is before the grasp
         self._observe(observer)
@@ -158,14 +159,14 @@ class HeldPart:
         """
         self._observe(observer)
         self._check_weight()
-        start = self._motion.pose().position[2]
+        self._start_z = float(self._motion.pose().position[2])
         slip = SlipMonitor(self.thresholds.contact)
         too_deep = min(depth_below + _BEYOND, self._lab.descent.max_depth)
         of_lab = self._lab.descent.stop_shear_mm
         stop = self.thresholds.stop * (1.0 if stop_shear_mm is None else stop_shear_mm / of_lab)
 
         def on_reading(reading: TactileReading) -> bool:
-            depth = self._keep(reading, start)
+            depth = self._keep(reading)
             if depth > too_deep:
                 raise SafetyError(f"the gripper is deeper than its descent of {1e3 * depth_below:g} mm")
             return slip.add(depth, reading.shear)
@@ -185,7 +186,7 @@ class HeldPart:
         # A stopped descent, like a complete one, ends with a pair of images at rest: the cameras are not synchronized.
         reading = self._guard.rest() if contact is not None else observer.update_pair(self._clock.now())
         if reading is not None:
-            self._keep(reading, start)
+            self._keep(reading)
         self._slip += slip.distance
         if self._slip > self._lab.part.max_slip:
             raise PartSlipped(f"the part slipped in the grip by up to {1e3 * self._slip:.1f} mm; hand it over again")
@@ -216,7 +217,7 @@ class HeldPart:
         self._event("contact with the floor" if on_floor else "contact below the rim", contact, height=height)
         if on_floor:
             return None
-        reading = self._guard.rest() or contact.reading
+        reading = self._with_depth(self._guard.rest() or contact.reading)
         if self._task.rim_height - height <= self._lab.hole.height_error:
             self._set_rim(height)
         return reading
@@ -259,11 +260,14 @@ class HeldPart:
             )
         self.height_offset = offset
 
-    def _keep(self, reading: TactileReading, start: float) -> float:
-        """Add a reading to those of the attempt; returns its depth below `start` [m]."""
-        depth = float(start - self._motion.height_at(reading.frame.stamp))
-        self._guard.observer.add_reading(replace(reading, depth=depth))
-        return depth
+    def _keep(self, reading: TactileReading) -> float:
+        """Add a reading to those of the attempt; returns its depth below the start [m]."""
+        reading = self._with_depth(reading)
+        self._guard.observer.add_reading(reading)
+        return reading.depth
+
+    def _with_depth(self, reading: TactileReading) -> TactileReading:
+        return replace(reading, depth=float(self._start_z - self._motion.height_at(reading.frame.stamp)))
 
     def _lower_face(self) -> float:
         """Height of the part's lower face above the taught floor, by the measured pose [m]."""

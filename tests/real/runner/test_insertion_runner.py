@@ -32,6 +32,7 @@ from gelflow.real.runner.run_plan import dry_run, run_insertions
 from gelflow.real.runner.supervisor import Supervisor
 from gelflow.real.runner.touch.grasp_check import nominal_thresholds
 from gelflow.real.runner.touch.guarded_motion import Contact
+from gelflow.real.runner.touch.observer import TactileReading
 from gelflow.session.reader import SessionReader
 from gelflow.task import INSERTION, insertion_task
 
@@ -242,7 +243,9 @@ def held_part(lab: Lab, height: float, move: Callable[..., Any]) -> HeldPart:
     supervisor = Supervisor(lab)
     for phase in (Phase.LOAD, Phase.APPROACH, Phase.DESCEND):
         supervisor.phases.enter(phase)
-    part._motion = SimpleNamespace(supervisor=supervisor, pose=lambda: lab.gripper_at(0.0, 0.0, 0.0, height))
+    pose = lab.gripper_at(0.0, 0.0, 0.0, height)
+    part._motion = SimpleNamespace(supervisor=supervisor, pose=lambda: pose, height_at=lambda _: pose.position[2])
+    part._start_z = lab.gripper_at(0.0, 0.0, 0.0, INSERTION.start_height).position[2]
     part._guard = SimpleNamespace(move=lambda target, **_: move(target), rest=lambda: None)
     part._recorder = SimpleNamespace(event=lambda *_: None)
     part._lab, part._task, part.thresholds = lab, INSERTION, nominal_thresholds(lab.descent)
@@ -266,10 +269,13 @@ def test_contact_at_a_low_rim_is_no_floor_where_the_workspace_ends_above_it() ->
         part=replace(EXAMPLE.part, insert_to=0.0206),
         workspace=replace(EXAMPLE.workspace, height_min=0.0205),
     )
-    reading: Any = SimpleNamespace(shear=0.3, frame=SimpleNamespace(stamp=0.0))
+    frame: Any = SimpleNamespace(stamp=0.0)
+    reading = TactileReading(frame, (), 0.0, np.full((2, 2), 0.3))
     part = held_part(lab, 0.0208, lambda target: Contact(reading, 0.3))
     part.height_offset = -0.004
-    assert part.lower((0.0, 0.0, 0.0)) is reading  # None: on the floor, which counts as inserted
+    lowered = part.lower((0.0, 0.0, 0.0))
+    assert lowered is not None  # None: on the floor, which counts as inserted
+    assert lowered.depth == pytest.approx(INSERTION.start_height - 0.0208)  # the decision records it
 
 
 def test_a_run_refuses_a_target_outside_the_workspace_as_a_dry_run_does(robot: MockRobot, tmp_path: Path) -> None:
