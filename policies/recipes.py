@@ -72,13 +72,13 @@ class Recipe:
         """The learner on `task`; `steps` is the length of the whole training."""
         return self.learner(self, task, seed, steps)
 
-    def configuration(self) -> dict[str, Any]:
-        """The settings that determine the result, as JSON data."""
+    def configuration(self, **options: Any) -> dict[str, Any]:
+        """The settings that determine the result, as JSON data; `options` of the task replace those of the recipe."""
         values = {"algorithm": self.algorithm, "settings": dataclasses.asdict(self.settings)}
         if (noise := self.options.get("noise")) is not None:
             values["noise"] = dataclasses.asdict(noise)
         if (preset := self.options.get("preset")) is not None:
-            values["preset"] = preset
+            values["preset"] = options.get("preset", preset)
         return values
 
 
@@ -289,6 +289,6 @@ def training_run(
         learner.start_from(checkpoint)
         origin["start"] = checkpoint.digest
     stored = {name: value for name, value in given.items() if name != "task"}  # the run stores the description
-    configuration = {"recipe": recipe, "options": stored, **origin, **chosen.configuration()}
+    configuration = {"recipe": recipe, "options": stored, **origin, **chosen.configuration(**stored)}
     validation = chosen.make_task(envs, **given)
     return TrainingRun(learner, validation, folder, settings, configuration, command, report, chosen.policy_name)

@@ -303,6 +303,7 @@ def test_a_recipe_makes_a_learner_and_knows_the_columns_of_its_learning_curve(ta
     assert learner.steps == 0
     assert recipe.curve_columns == table_columns(learner.columns)[1:]
     json.dumps(recipe.configuration())
+    assert recipe.configuration(preset="accurate").get("preset") in (None, "accurate")  # none but that of the training
 
 
 def test_every_episode_counts_once_whatever_its_length() -> None:
