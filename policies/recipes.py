@@ -73,7 +73,7 @@ class Recipe:
         return self.learner(self, task, seed, steps)
 
     def configuration(self, **options: Any) -> dict[str, Any]:
-        """The settings that determine the result, as JSON data; `options` of the task replace those of the recipe."""
+        """The settings that determine the result, as JSON data; a `preset` in `options` replaces that of the recipe."""
         values = {"algorithm": self.algorithm, "settings": dataclasses.asdict(self.settings)}
         if (noise := self.options.get("noise")) is not None:
             values["noise"] = dataclasses.asdict(noise)
